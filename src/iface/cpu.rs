@@ -18,6 +18,7 @@ use tiface_kernels::cpu::losses::{self, RAY_TERMS, STEREO_STREAM, TERMS, Targets
 use tiface_kernels::cpu::march::Samples;
 use tiface_kernels::cpu::mlp::Weights;
 use tiface_kernels::cpu::neus::{self, Segments};
+use tiface_kernels::cpu::pool::Buffer;
 use tiface_kernels::cpu::schedule::Figures;
 use tiface_kernels::cpu::sdf::{self, Activations, FieldShape, WIDTH};
 use tiface_kernels::cpu::weight_norm;
@@ -48,6 +49,8 @@ struct CpuStep {
     samples: Samples,
     direction: Vec<[f32; 3]>,
     dts: Vec<f32>,
+    /// `[samples + points, 3]`.
+    position: Vec<[f32; 3]>,
     /// `[samples, 3]` directions of the samples' rays.
     along: Vec<[f32; 3]>,
     points: Vec<SurfacePoint>,
@@ -55,7 +58,7 @@ struct CpuStep {
     composed: Vec<f32>,
     terms: [f32; TERMS],
     /// `[samples + points, 8]`.
-    g_field: Vec<f32>,
+    g_field: Buffer,
     g_inv_s: f32,
     non_finite: bool,
 }
@@ -200,12 +203,12 @@ impl SdfOps for CpuSdf<'_> {
         if self.step.is_empty() {
             return;
         }
-        let step = &self.step;
-        let (mut x, along) = step.samples.points(&step.batch.rays);
-        x.extend(step.points.iter().map(|p| p.position));
+        let CpuStep { samples, batch, points, position, along, .. } = &mut self.step;
+        samples.points_into(&batch.rays, position, along);
+        position.extend(points.iter().map(|p| p.position));
         let table = bytemuck::cast_slice(slice(table.value()));
-        let activations = sdf::geometry(&self.shape, table, self.prepared(), &x);
-        (self.step.activations, self.step.along) = (Some(activations), along);
+        let activations = sdf::geometry(&self.shape, table, self.prepared(), &self.step.position);
+        self.step.activations = Some(activations);
     }
 
     fn neus(&mut self, anneal: f32) {
@@ -229,17 +232,12 @@ impl SdfOps for CpuSdf<'_> {
         let (of_rays, g_composed) = losses::of_rays(&step.composed, targets, &w);
         let field = output(&step.activations);
         let n = step.samples.t.len();
-        let (mut g_field, g_inv_s) = neus::backward(
-            step.segments(self.config.min_weight),
-            &field[..n * WIDTH],
-            self.inv_s,
-            anneal,
-            &g_composed,
-        );
-        let of_samples = losses::of_samples(&field[..n * WIDTH], &w, &mut g_field);
-        g_field.resize(field.len(), 0.0);
+        let (mut g_field, g_inv_s) =
+            neus::backward(step.segments(self.config.min_weight), field, self.inv_s, anneal, &g_composed);
+        let (of_samples, of_points) = g_field.split_at_mut(n * WIDTH);
+        let of_samples = losses::of_samples(&field[..n * WIDTH], &w, of_samples);
         let points: Vec<[f32; 2]> = step.points.iter().map(|p| [p.footprint, p.weight]).collect();
-        let of_points = losses::of_points(&field[n * WIDTH..], &points, &w, &mut g_field[n * WIDTH..]);
+        let of_points = losses::of_points(&field[n * WIDTH..], &points, &w, of_points);
         step.terms[..RAY_TERMS].copy_from_slice(&of_rays);
         step.terms[RAY_TERMS..TERMS - 1].copy_from_slice(&of_samples);
         step.terms[TERMS - 1] = of_points;
@@ -252,7 +250,9 @@ impl SdfOps for CpuSdf<'_> {
         };
         let weights = self.weights.as_ref().expect("the field was evaluated with them");
         let g_table = bytemuck::cast_slice_mut(slice_mut(&mut table.gradient));
-        let g_flat = sdf::backward(&activations, weights, &self.step.g_field, g_table);
+        // back in the pool before the next step asks for as much
+        let g_field = std::mem::take(&mut self.step.g_field);
+        let g_flat = sdf::backward(&activations, weights, &g_field, g_table);
         let (parameters, gradient) = network.value_and_gradient();
         let g_network = slice_mut(gradient);
         weight_norm::backward(self.shape.layout(), slice(parameters), &g_flat, g_network);

@@ -131,7 +131,7 @@ fn directionless(cases: &mut Cases) {
             let out = neus::forward(bundle.rays(), &field, inv_s, 1.0);
             let (by_field, by_s) = neus::backward(bundle.rays(), &field, inv_s, 1.0, &g);
             let finite = |v: &f32| if v.is_finite() { v.abs() as f64 } else { f64::NAN };
-            largest.push(worst(out.iter().chain(&by_field).chain([&by_s]).map(finite)));
+            largest.push(worst(out.iter().chain(&by_field[..]).chain([&by_s]).map(finite)));
         }
         // a direction's gradient is that of a unit vector by the length; by the distance up to the
         // sharpness

@@ -25,16 +25,24 @@ pub struct Samples {
 impl Samples {
     /// Returns positions and directions of the samples of the batch's rays.
     pub fn points(&self, rays: &[Ray]) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
-        let (mut points, mut directions) = (vec![[0f32; 3]; self.t.len()], vec![[0f32; 3]; self.t.len()]);
+        let (mut points, mut directions) = (Vec::new(), Vec::new());
+        self.points_into(rays, &mut points, &mut directions);
+        (points, directions)
+    }
+
+    /// Replaces what the lists hold by positions and directions of the samples of the batch's rays.
+    pub fn points_into(&self, rays: &[Ray], points: &mut Vec<[f32; 3]>, directions: &mut Vec<[f32; 3]>) {
+        for list in [&mut *points, directions] {
+            list.clear();
+            list.reserve(self.t.len());
+        }
         for (ray, span) in rays.iter().zip(self.offsets.windows(2)) {
             let (o, d) = (ray.origin.to_array(), ray.direction.to_array());
-            for s in span[0] as usize..span[1] as usize {
-                let t = self.t[s];
-                points[s] = [o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]];
-                directions[s] = d;
+            for t in &self.t[span[0] as usize..span[1] as usize] {
+                points.push([o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]]);
+                directions.push(d);
             }
         }
-        (points, directions)
     }
 }
 

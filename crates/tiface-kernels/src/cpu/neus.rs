@@ -17,6 +17,7 @@
 //! evaluated; its opacity counts.
 
 use super::hash::{LANES, Lanes};
+use super::pool::Buffer;
 use super::sdf::WIDTH;
 use super::simd::{exp, sigmoid_and_complement};
 use rayon::prelude::*;
@@ -343,21 +344,15 @@ dispatch! {
     )
 }
 
-/// Returns the gradients with respect to the field's output, `[samples, 8]`, and with respect to
-/// `inv_s`.
+/// Returns the gradients with respect to the field's output, `[n, 8]`, and with respect to `inv_s`.
 ///
 /// # Shapes
 ///
+/// - field: `[n, 8]`, the output of the field; the gradient of rows beyond the samples is zero
 /// - g_out: `[rays, 9]`, the gradient of the loss with respect to the output of [`forward`]
-pub fn backward(
-    segments: Segments,
-    field: &[f32],
-    inv_s: f32,
-    anneal: f32,
-    g_out: &[f32],
-) -> (Vec<f32>, f32) {
+pub fn backward(segments: Segments, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32]) -> (Buffer, f32) {
     let clamped = inv_s.clamp(1e-6, 1e6);
-    let mut g_field = vec![0f32; field.len()];
+    let mut g_field = Buffer::zeroed(field.len());
     let mut tasks: Vec<NeusBackwardTask> = by_task(segments.offsets, &mut g_field, WIDTH)
         .into_iter()
         .map(|(first, g_field)| NeusBackwardTask { first, g_field, g_ln_inv_s: Vec::with_capacity(RAYS) })

@@ -51,6 +51,13 @@ impl Buffer {
         v.resize(len, 0.0);
         Buffer(v)
     }
+
+    /// Returns a buffer of `len` zeros.
+    pub fn zeroed(len: usize) -> Buffer {
+        let mut buffer = Buffer::scratch(len);
+        buffer.fill(0.0);
+        buffer
+    }
 }
 
 /// Splits buffers into pieces of `rows` rows; `widths` are the floats per row of each buffer. Each
@@ -131,5 +138,11 @@ mod tests {
     fn buffers_of_another_length_are_cut_to_it() {
         drop(Buffer::scratch(5000));
         assert_eq!(Buffer::scratch(4999).len(), 4999);
+    }
+
+    #[test]
+    fn a_buffer_of_zeros_has_nothing_of_its_last_use() {
+        Buffer::scratch(5000).fill(1.0);
+        assert!(Buffer::zeroed(4998).iter().all(|v| *v == 0.0));
     }
 }

@@ -169,7 +169,8 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
     }
     let active = &a.shape.levels[..a.shape.active];
     let mut g_value = Buffer::scratch(active.len() * n * 2);
-    let mut g_normal = vec![[0f32; 3]; n];
+    let mut g_normal = Buffer::scratch(3 * n);
+    let g_normal: &mut [[f32; 3]] = bytemuck::cast_slice_mut(&mut g_normal);
     let mut tasks: Vec<SdfBackwardTask> = by_chunk(bytemuck::cast_slice_mut(&mut g_value), n, CHUNK)
         .into_iter()
         .zip(g_normal.chunks_mut(CHUNK))
@@ -200,7 +201,7 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
         a.shape.world(),
         bytemuck::cast_slice(&g_value),
         bytemuck::cast_slice(&a.q),
-        &g_normal,
+        g_normal,
     );
     flat
 }
