@@ -18,6 +18,7 @@
 use super::{RayHits, RenderedView};
 use glam::{DVec3, Mat3, Vec2, Vec3};
 use rayon::prelude::*;
+use std::array::from_fn;
 use tiface_base::geom::{Camera, bilinear_taps};
 use tiface_base::image::{Gray, OPAQUE_ALPHA, Photo, eroded};
 
@@ -127,6 +128,7 @@ impl Residuals {
             !self.leaves_out_own || !is_same_position(view.camera.position, camera.position)
         };
         let views: Vec<&ResidualView> = self.views.iter().filter(counts).collect();
+        let views: Vec<ViewBlock> = views.chunks(LANES).map(ViewBlock::new).collect();
         for (i, color) in colors.iter_mut().enumerate() {
             let change = self.at(&views, hits.points[i], hits.normals[i], hits.directions[i]);
             *color = (Vec3::from(*color) + change).clamp(Vec3::ZERO, Vec3::ONE).to_array();
@@ -134,18 +136,18 @@ impl Residuals {
     }
 
     /// Returns the change of color at a point of the surface that is seen along a direction.
-    fn at(&self, views: &[&ResidualView], point: Vec3, normal: Vec3, direction: Vec3) -> Vec3 {
+    fn at(&self, views: &[ViewBlock], point: Vec3, normal: Vec3, direction: Vec3) -> Vec3 {
         let least = 1.0 - self.reach; // below a right angle
         let (mut sum, mut mean, mut square) = (0.0, Vec3::ZERO, 0.0);
-        for view in views {
+        // most views are out of reach
+        let near = views.iter().flat_map(|block| {
+            let within = block.within(least, point, direction);
+            block.views.iter().zip(within).filter(|(_, within)| *within).map(|(view, _)| view)
+        });
+        for view in near {
             let to_view = view.position - point;
-            let (along, square_distance) = (-to_view.dot(direction), to_view.length_squared());
-            // most views are out of reach, which needs no root
-            if along <= 0.0 || along * along <= least * least * square_distance {
-                continue;
-            }
-            let distance = square_distance.sqrt();
-            let u = (1.0 - along / distance) / self.reach;
+            let distance = to_view.length();
+            let u = (1.0 + to_view.dot(direction) / distance) / self.reach;
             let slant = ((normal.dot(to_view) / distance - SLANT.0) / (SLANT.1 - SLANT.0)).clamp(0.0, 1.0);
             if u >= 1.0 || slant == 0.0 {
                 continue;
@@ -162,6 +164,39 @@ impl Residuals {
         mean /= sum;
         let variance = (square / sum - mean.length_squared()).max(0.0) / 3.0;
         mean * sum / (sum + HALF_WEIGHT) / (1.0 + variance / (HALF_DEVIATION * HALF_DEVIATION))
+    }
+}
+
+/// Number of views whose reach is tested together.
+const LANES: usize = 8;
+
+/// Some views, and their positions as the test of reach reads them.
+struct ViewBlock<'a> {
+    /// At most [`LANES`].
+    views: &'a [&'a ResidualView],
+    /// `[axis][view]`, NaN beyond the last.
+    position: [[f32; LANES]; 3],
+}
+
+impl<'a> ViewBlock<'a> {
+    fn new(views: &'a [&'a ResidualView]) -> ViewBlock<'a> {
+        let at = |axis: usize, view: usize| views.get(view).map_or(f32::NAN, |view| view.position[axis]);
+        ViewBlock { views, position: from_fn(|axis| from_fn(|view| at(axis, view))) }
+    }
+
+    /// Returns for which views the cosine between the direction to a point and `direction` is above
+    /// `least`, which is not negative.
+    #[inline]
+    fn within(&self, least: f32, point: Vec3, direction: Vec3) -> [bool; LANES] {
+        let [x, y, z] = &self.position;
+        let mut within = [false; LANES];
+        for i in 0..LANES {
+            let d = [x[i] - point.x, y[i] - point.y, z[i] - point.z];
+            let along = -(d[0] * direction.x + d[1] * direction.y + d[2] * direction.z);
+            let square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+            within[i] = (along > 0.0) & (along * along > least * least * square);
+        }
+        within
     }
 }
 
@@ -405,10 +440,15 @@ mod tests {
         let photos: Vec<Photo> =
             cameras.iter().zip(0u8..).map(|(c, k)| photo(c, waves(f32::from(k)))).collect();
         let residuals = residuals(&mesh, &cameras, &photos, None).unwrap();
+        // blocks of one view and of four count like one of five
         let all: Vec<&ResidualView> = residuals.views.iter().collect();
+        let parts = [&all[..1], &all[1..]].map(ViewBlock::new);
+        let all = [ViewBlock::new(&all)];
         let change = |x: f64| {
             let direction = (Vec3::ZERO - camera(x).position.as_vec3()).normalize();
-            residuals.at(&all, Vec3::ZERO, Vec3::Z, direction).x
+            let change = residuals.at(&all, Vec3::ZERO, Vec3::Z, direction);
+            assert_eq!(residuals.at(&parts, Vec3::ZERO, Vec3::Z, direction), change);
+            change.x
         };
         let path: Vec<f32> = (0..=4000).map(|i| change(-2.0 + i as f64 * 0.001)).collect();
         let steps = path.windows(2).map(|w| (w[1] - w[0]).abs());

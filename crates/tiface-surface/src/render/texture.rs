@@ -140,10 +140,11 @@ impl MipMaps {
     }
 
     /// Returns the level whose texels are nearest in size to a footprint of this many of the
-    /// finest.
+    /// finest: the base-2 logarithm, rounded.
     fn nearest(&self, texels: f32) -> &MipLevel {
-        let last = self.levels.len() - 1;
-        &self.levels[texels.max(1.0).log2().round().clamp(0.0, last as f32) as usize]
+        // half a level more, since whole levels are rounded down
+        let (level, _) = mip_level(texels * std::f32::consts::SQRT_2, self.levels.len());
+        &self.levels[level]
     }
 
     /// Interpolates a group of channels bilinearly, in integer steps.
@@ -233,11 +234,12 @@ impl MeshTexture {
     /// Returns the sRGB-coded base colors of the hits of a camera's rays, `samples` of them along
     /// each side of a pixel.
     pub fn base_colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
+        let table = srgb_table();
         let one = |i: usize| {
             let (uv, texels) = self.footprint(hits, i, camera, samples);
             let (at, way) = around(self.base.nearest(texels), uv.x, uv.y);
             let linear = self.base.look_up(at, way, 0);
-            from_fn(|k| srgb_from_linear(linear[k] / STEPS))
+            from_fn(|k| coded(table, linear[k] / STEPS))
         };
         (0..hits.hits.len()).map(one).collect()
     }
