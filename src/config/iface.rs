@@ -81,7 +81,7 @@ table! {
         /// Ratio of the resolutions of consecutive levels.
         growth: f64, 1.0..=4.0 [Iface] => 1.4, 1.4, 1.319_507_910_772_894_2;
         /// Binary logarithm of a level's largest table.
-        log2_table: u32, 4.0..=24.0 [Iface] => 18, 19, 19;
+        log2_table: u32, 4.0..=24.0 [Iface] => 17, 19, 19, 18;
         /// Largest ratio of the local to the smallest width of the surface, for hair (spatially
         /// varying sharpness, after Adaptive Shells, Wang et al. 2023); 1: one sharpness everywhere
         /// (published).
