@@ -314,10 +314,15 @@ pub(super) fn scatter(grid: &Grid, gradients: &FactorGradients, gradient: &mut [
         .filter(|bands| !bands[0].line)
         .for_each(|bands| {
             let axis = PLANE_AXES[bands[0].term].1;
-            let rows = bands.get(1).map_or(u32::MAX, |second| second.row as u32);
+            // a table, since a division takes longer than all else that is done for a sample
+            let band_of: Vec<usize> = bands
+                .iter()
+                .enumerate()
+                .flat_map(|(i, band)| std::iter::repeat_n(i, band.values.len() / (band.width * band.channels)))
+                .collect();
             for (s, cell) in gradients.cells.iter().enumerate() {
-                let row = cell.index[axis];
-                let (band, next) = ((row / rows) as usize, ((row + 1) / rows) as usize);
+                let row = cell.index[axis] as usize;
+                let (band, next) = (band_of[row], band_of[row + 1]);
                 bands[band].samples.push(s as u32);
                 if next != band {
                     bands[next].samples.push(s as u32);

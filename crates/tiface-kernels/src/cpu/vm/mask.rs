@@ -6,19 +6,30 @@
 //! *before* the field is evaluated. Sample positions `t = entry + step · (k + jitter)` do not
 //! depend on the mask.
 
+#[cfg(feature = "wgpu")]
 use crate::cpu::march::BLOCK;
 use tiface_base::geom::Ray;
 
-/// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`. A
-/// second bitmask holds the blocks with an occupied cell, so that rays can skip empty blocks.
+/// Number of cells along the edge of a brick, whose bits are one word.
+const BRICK: usize = 4;
+
+/// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`.
+///
+/// For rays the bits are stored again by bricks, so that a word holds those of the cells around a
+/// point, with the distance to the nearest brick that is not empty.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BoxMask {
     min: [f32; 3],
     max: [f32; 3],
     size: [usize; 3],
     bits: Vec<u64>,
-    /// One bit per block of `BLOCK`³ cells, set if the block contains an occupied cell.
-    blocks: Vec<u64>,
+    /// Number of bricks along each axis.
+    bricks: [usize; 3],
+    /// The bits of each brick's cells, in the order of cells.
+    words: Vec<u64>,
+    /// Of each brick, the number of bricks to the nearest one with an occupied cell, along the axis
+    /// in which they are farthest apart: 0 if the brick itself has one, at most 255.
+    free: Vec<u8>,
 }
 
 fn bit(bits: &[u64], i: usize) -> bool {
@@ -28,6 +39,30 @@ fn bit(bits: &[u64], i: usize) -> bool {
 /// Iterates over the cells of a box in the order of their bits.
 fn cells([nx, ny, nz]: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
     (0..nx).flat_map(move |x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])))
+}
+
+/// Returns, of each cell of a box, the number of cells to the nearest one that is `marked`, along
+/// the axis in which they are farthest apart, at most 255.
+///
+/// One pass from each end of the box finds them (Borgefors 1986, "Distance transformations in
+/// digital images").
+fn distances(size: [usize; 3], marked: impl Iterator<Item = bool>) -> Vec<u8> {
+    let mut distance: Vec<u8> = marked.map(|marked| if marked { 0 } else { u8::MAX }).collect();
+    let near = |at: usize, count: usize| at.saturating_sub(1)..(at + 2).min(count);
+    let mut visit = |i: usize, [x, y, z]: [usize; 3]| {
+        for u in near(x, size[0]) {
+            for v in near(y, size[1]) {
+                for w in near(z, size[2]) {
+                    let beside = distance[(u * size[1] + v) * size[2] + w].saturating_add(1);
+                    distance[i] = distance[i].min(beside);
+                }
+            }
+        }
+    };
+    let all: Vec<_> = cells(size).enumerate().collect();
+    all.iter().for_each(|&(i, cell)| visit(i, cell));
+    all.iter().rev().for_each(|&(i, cell)| visit(i, cell));
+    distance
 }
 
 impl BoxMask {
@@ -52,13 +87,14 @@ impl BoxMask {
         if bits.len() != count.div_ceil(64) {
             return None;
         }
-        let b = size.map(|n| n.div_ceil(BLOCK));
-        let mut blocks = vec![0; (b[0] * b[1] * b[2]).div_ceil(64)];
+        let bricks = size.map(|n| n.div_ceil(BRICK));
+        let mut words = vec![0; bricks.iter().product()];
         for [x, y, z] in cells(size).enumerate().filter(|(i, _)| bit(&bits, *i)).map(|(_, c)| c) {
-            let i = ((x / BLOCK) * b[1] + y / BLOCK) * b[2] + z / BLOCK;
-            blocks[i >> 6] |= 1 << (i & 63);
+            let brick = ((x / BRICK) * bricks[1] + y / BRICK) * bricks[2] + z / BRICK;
+            words[brick] |= 1 << ((x % BRICK * BRICK + y % BRICK) * BRICK + z % BRICK);
         }
-        Some(BoxMask { min, max, size, bits, blocks })
+        let free = distances(bricks, words.iter().map(|&word| word != 0));
+        Some(BoxMask { min, max, size, bits, bricks, words, free })
     }
 
     /// Creates a mask from marked vertices: a cell is occupied if one of its eight corners is
@@ -104,8 +140,16 @@ impl BoxMask {
     /// Returns one bit per block of 8³ cells, set if the block contains an occupied cell, in the
     /// order of cells.
     #[cfg(feature = "wgpu")]
-    pub fn blocks(&self) -> &[u64] {
-        &self.blocks
+    pub fn blocks(&self) -> Vec<u64> {
+        let size = self.size.map(|n| n.div_ceil(BLOCK));
+        let mut blocks = vec![0; size.iter().product::<usize>().div_ceil(64)];
+        let occupied = cells(self.bricks).zip(&self.words).filter(|(_, word)| **word != 0);
+        for ([x, y, z], _) in occupied {
+            let [x, y, z] = [x, y, z].map(|brick| brick * BRICK / BLOCK);
+            let i = (x * size[1] + y) * size[2] + z;
+            blocks[i >> 6] |= 1 << (i & 63);
+        }
+        blocks
     }
 
     /// Returns the fraction of cells that are occupied, 0..=1.
@@ -183,25 +227,108 @@ pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3
     (enter, leave)
 }
 
+/// Values of the three axes, and of a fourth lane that changes nothing, so that each operation is
+/// one instruction.
+type Axes = [f32; 4];
+
 /// Walks over the lattice points of a ray inside the box and inside a mask.
 ///
 /// This is a state rather than a closure, because a closure would be compiled without the vector
 /// instructions of the kernel that calls it.
 pub struct Walk<'a> {
-    lattice: &'a Lattice,
-    mask: Option<&'a BoxMask>,
-    origin: [f32; 3],
-    direction: [f32; 3],
+    mask: Option<(&'a BoxMask, MaskWalk)>,
+    origin: Axes,
+    direction: Axes,
+    /// The field's box, with slack for rounding.
+    low: Axes,
+    high: Axes,
     start: f32,
+    step: f32,
     leave: f32,
     /// Index of the next lattice point.
-    k: i64,
-    end: i64,
+    k: i32,
+    end: i32,
+}
+
+/// What the walk of a ray through a mask needs at each of its points.
+struct MaskWalk {
+    /// Lower corner of the mask.
+    low: Axes,
     /// Mask cells per unit of length.
-    scale: [f32; 3],
-    /// Inverse of the number of mask cells that the ray crosses per unit of `t`.
-    inverse: [f32; 3],
-    blocks: [usize; 3],
+    scale: Axes,
+    /// Number of cells.
+    size: [i32; 4],
+    /// Lattice steps per mask cell; 0 along an axis that the ray does not move along.
+    steps: Axes,
+    /// Infinity along an axis that the ray does not move along, else 0.
+    never: Axes,
+    /// Whether the ray moves up.
+    ahead: [bool; 4],
+}
+
+impl MaskWalk {
+    fn new(mask: &BoxMask, direction: Axes, step: f32) -> MaskWalk {
+        let (low, mut scale) = (axes(mask.min, 0.0), [0f32; 4]);
+        let (mut size, mut steps, mut never) = ([1; 4], [0f32; 4], [f32::INFINITY; 4]);
+        for a in 0..3 {
+            size[a] = mask.size[a] as i32;
+            scale[a] = mask.size[a] as f32 / (mask.max[a] - mask.min[a]);
+            if direction[a] != 0.0 {
+                (steps[a], never[a]) = (1.0 / (direction[a] * scale[a] * step), 0.0);
+            }
+        }
+        MaskWalk { low, scale, size, steps, never, ahead: direction.map(|d| d > 0.0) }
+    }
+
+    /// Returns `None` if the point lies in an occupied cell, or else the number of lattice steps to
+    /// the next point that may lie in one.
+    #[inline(always)]
+    fn skip(&self, mask: &BoxMask, p: &Axes) -> Option<i32> {
+        let (mut g, mut c) = ([0f32; 4], [0i32; 4]);
+        let mut outside = false;
+        for a in 0..4 {
+            g[a] = (p[a] - self.low[a]) * self.scale[a];
+            let top = self.size[a] as f32;
+            // written so that NaN is outside, too
+            outside |= !(g[a] >= -1e-3 && g[a] <= top + 1e-3);
+            // SAFETY: the bounds keep the position, and NaN, in the range of i32.
+            c[a] = unsafe { g[a].max(0.0).min(top - 1.0).to_int_unchecked() };
+        }
+        if outside {
+            return Some(1);
+        }
+        let mut brick = [0i32; 4];
+        for a in 0..4 {
+            brick[a] = c[a] / BRICK as i32;
+        }
+        let at = (brick[0] as usize * mask.bricks[1] + brick[1] as usize) * mask.bricks[2] + brick[2] as usize;
+        let free = i32::from(mask.free[at]);
+        if free == 0 {
+            let within = (c[0] as usize % BRICK * BRICK + c[1] as usize % BRICK) * BRICK + c[2] as usize % BRICK;
+            if mask.words[at] >> within & 1 == 1 {
+                return None;
+            }
+        }
+        // to the border of the empty cell or of the empty bricks around it
+        let mut border = [0f32; 4];
+        for a in 0..4 {
+            let up = if free == 0 { c[a] + 1 } else { (brick[a] + free) * BRICK as i32 };
+            let down = if free == 0 { c[a] } else { (brick[a] + 1 - free) * BRICK as i32 };
+            let wall = if self.ahead[a] { up.min(self.size[a]) } else { down.max(0) };
+            border[a] = (wall as f32 - g[a]) * self.steps[a] + self.never[a];
+        }
+        let steps = border[0].min(border[1]).min(border[2]);
+        // slightly less than that, so that rounding cannot skip a sample in the next cell
+        let whole = (steps - 1e-3).clamp(1.0, 1e9).ceil();
+        // SAFETY: the bounds keep the number, and NaN, in the range of i32.
+        Some(unsafe { whole.max(1.0).to_int_unchecked() })
+    }
+}
+
+/// Returns the values of three axes, with another one in the fourth lane.
+#[inline(always)]
+fn axes([x, y, z]: [f32; 3], fourth: f32) -> Axes {
+    [x, y, z, fourth]
 }
 
 impl<'a> Walk<'a> {
@@ -209,82 +336,50 @@ impl<'a> Walk<'a> {
     /// part of a step; it has no points if the ray misses the box.
     #[inline(always)]
     pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &Ray, jitter: f32) -> Walk<'a> {
-        let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
+        let (origin, direction) = (axes(ray.origin.to_array(), 0.0), axes(ray.direction.to_array(), 0.0));
         let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
         let (enter, leave) = crossing.unwrap_or((0.0, 0.0));
         let start = enter.clamp(lattice.near, lattice.far) + jitter * lattice.step;
-        let any = crossing.is_some() && start.is_finite();
-        let mut scale = [0f32; 3];
-        let mut inverse = [0f32; 3];
-        let mut blocks = [0; 3];
-        if let Some(m) = mask {
-            for a in 0..3 {
-                scale[a] = m.size[a] as f32 / (m.max[a] - m.min[a]);
-                inverse[a] = 1.0 / (direction[a] * scale[a]);
-                blocks[a] = m.size[a].div_ceil(BLOCK);
-            }
+        let (mut low, mut high) = (axes(lattice.min, 0.0), axes(lattice.max, 0.0));
+        for a in 0..3 {
+            let slack = 1e-6 * (lattice.max[a] - lattice.min[a]);
+            low[a] -= slack;
+            high[a] += slack;
         }
-        let end = if any { lattice.samples.saturating_sub(1) as i64 } else { 0 };
-        Walk { lattice, mask, origin, direction, start, leave, k: 0, end, scale, inverse, blocks }
+        let mask = mask.map(|mask| (mask, MaskWalk::new(mask, direction, lattice.step)));
+        let any = crossing.is_some() && start.is_finite();
+        let last = lattice.samples.saturating_sub(1).try_into().unwrap_or(i32::MAX);
+        // the border itself belongs to the box, and rounding may put a sample just outside
+        let leave = leave + lattice.step;
+        let end = if any { last } else { 0 };
+        Walk { mask, origin, direction, low, high, start, step: lattice.step, leave, k: 0, end }
     }
 
     /// Returns `t` of the next lattice point.
     #[inline(always)]
     pub fn advance(&mut self) -> Option<f32> {
-        let l = self.lattice;
         while self.k < self.end {
-            let t = self.start + l.step * self.k as f32;
-            // the border itself belongs to the box, and rounding may put a sample just outside
-            if t > self.leave + l.step {
+            let t = self.start + self.step * self.k as f32;
+            if t > self.leave {
                 return None;
             }
-            let mut p = [0f32; 3];
+            let mut p = [0f32; 4];
             let mut outside = false;
-            for a in 0..3 {
+            for a in 0..4 {
                 p[a] = self.origin[a] + t * self.direction[a];
-                let slack = 1e-6 * (l.max[a] - l.min[a]);
                 // written so that NaN is outside, too
-                outside |= !(p[a] >= l.min[a] - slack && p[a] <= l.max[a] + slack);
-            }
-            let Some(mask) = self.mask else {
-                self.k += 1;
-                if outside {
-                    continue;
-                }
-                return Some(t);
-            };
-            let mut g = [0f32; 3];
-            let mut c = [0usize; 3];
-            for a in 0..3 {
-                g[a] = (p[a] - mask.min[a]) * self.scale[a];
-                let top = mask.size[a] as f32;
-                outside |= !(g[a] >= -1e-3 && g[a] <= top + 1e-3);
-                c[a] = (g[a].max(0.0) as usize).min(mask.size[a] - 1);
+                outside |= !(p[a] >= self.low[a] && p[a] <= self.high[a]);
             }
             if outside {
                 self.k += 1;
                 continue;
             }
-            if bit(&mask.bits, (c[0] * mask.size[1] + c[1]) * mask.size[2] + c[2]) {
-                self.k += 1;
+            let skip = self.mask.as_ref().and_then(|(mask, walk)| walk.skip(mask, &p));
+            // a sum beyond the range of numbers is beyond the end, too
+            self.k = self.k.saturating_add(skip.unwrap_or(1));
+            if skip.is_none() {
                 return Some(t);
             }
-            // skip to the border of the empty cell, or of its block if that is empty too, by a
-            // whole number of steps
-            let block = [c[0] / BLOCK, c[1] / BLOCK, c[2] / BLOCK];
-            let at = (block[0] * self.blocks[1] + block[1]) * self.blocks[2] + block[2];
-            let empty = !bit(&mask.blocks, at);
-            let mut border = f32::INFINITY;
-            for a in 0..3 {
-                let ahead = usize::from(self.direction[a] > 0.0);
-                if self.direction[a] != 0.0 {
-                    let wall =
-                        if empty { ((block[a] + ahead) * BLOCK).min(mask.size[a]) } else { c[a] + ahead };
-                    border = border.min((wall as f32 - g[a]) * self.inverse[a]);
-                }
-            }
-            // slightly less than that, so that rounding cannot skip a sample in the next cell
-            self.k += ((border.max(0.0) / l.step - 1e-3).ceil() as i64).max(1);
         }
         None
     }

@@ -315,27 +315,21 @@ pub fn render(
         };
         march_rays(&mut marched, rays, jitter, field, &lookup);
         marched.color_of.resize(marched.kept.len(), COLORLESS);
-        let Marched { kept, offsets, color_of, colored, .. } = &mut marched;
-        for ends in offsets.windows(2) {
+        let Marched { kept, cells, offsets, color_of, colored, .. } = &mut marched;
+        let mut directions = Vec::with_capacity(kept.len() / 2);
+        for (ray, ends) in rays.iter().zip(offsets.windows(2)) {
             let of_ray = ends[0] as usize..ends[1] as usize;
             let weights = kept[of_ray.clone()].iter().map(KeptSample::weight);
             assign_colors(&field.shading, weights, ends[0], &mut color_of[of_ray], colored);
+            directions.resize(colored.len(), ray.direction.to_array());
         }
-        marched
+        let color_cells: Vec<Cell> = colored.iter().map(|&i| cells[i as usize]).collect();
+        (marched, (color_cells, directions))
     };
-    let marched: Vec<Marched> = rays.par_chunks(RAYS).enumerate().map(march).collect();
-
-    let colors = marched.iter().map(|m| m.colored.len()).sum();
-    let (mut color_cells, mut directions) = (Vec::with_capacity(colors), Vec::with_capacity(colors));
-    for (m, rays) in marched.iter().zip(rays.chunks(RAYS)) {
-        color_cells.extend(m.colored.iter().map(|&i| m.cells[i as usize]));
-        let mut colored = m.colored.iter().peekable();
-        for (ray, samples) in rays.iter().zip(m.rays()) {
-            while colored.next_if(|&&i| (i as usize) < samples.end).is_some() {
-                directions.push(ray.direction.to_array());
-            }
-        }
-    }
+    let (marched, colored): (Vec<Marched>, Vec<_>) = rays.par_chunks(RAYS).enumerate().map(march).unzip();
+    let (color_cells, directions): (Vec<_>, Vec<_>) = colored.into_iter().unzip();
+    let (color_cells, directions) = (color_cells.concat(), directions.concat());
+    let colors = color_cells.len();
     let decoded = decoder::decode(&field.color, color, decoder, color_cells, &directions);
 
     let mut out = vec![0f32; rays.len() * RAY_WIDTH];

@@ -204,10 +204,16 @@ fn a_mask_removes_samples_and_moves_none() {
         far: 9.0,
     };
     // the mask's box is smaller than the field's, as after an update before the box shrinks again
-    let hit = |c: [usize; 3]| (c[0] * 7 + c[1] * 3 + c[2]).is_multiple_of(11) && c[0] < 30;
-    let mask = BoxMask::new([-0.9, -0.8, -1.2], [1.0, 0.7, 1.1], [37, 20, 29], hit);
-    let mut hit_rays = 0;
-    for i in 0..50 {
+    let masked = |one_in: usize| {
+        let hit = |c: [usize; 3]| (c[0] * 7 + c[1] * 3 + c[2]).is_multiple_of(one_in) && c[0] < 30;
+        BoxMask::new([-0.9, -0.8, -1.2], [1.0, 0.7, 1.1], [37, 20, 29], hit)
+    };
+    // hardly an empty brick, and hardly one that is not
+    let masks = [masked(11), masked(293)];
+    let (mut hit_rays, mut left) = (0, [0; 2]);
+    for (mask, i) in (0..50).flat_map(|i| [(0, i), (1, i)]) {
+        let masks_left = &mut left[mask];
+        let mask = &masks[mask];
         let u = |k: u64| rng::uniform(9, 1, 8 * i + k) - 0.5;
         let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(0), 0.8 * u(1), -1.0] };
         let ray = Ray::new([u(2), u(3), 3.0], direction);
@@ -215,7 +221,8 @@ fn a_mask_removes_samples_and_moves_none() {
             let mut walk = Walk::new(&lattice, mask, &ray, u(4) + 0.5);
             std::iter::from_fn(|| walk.advance()).collect::<Vec<f32>>()
         };
-        let (all, some) = (points(None), points(Some(&mask)));
+        let (all, some) = (points(None), points(Some(mask)));
+        *masks_left += some.len();
         let want: Vec<f32> = all
             .iter()
             .copied()
@@ -227,7 +234,7 @@ fn a_mask_removes_samples_and_moves_none() {
             + some.iter().filter(|t| !want.contains(t)).count();
         assert!(differing <= 1, "ray {i}: {differing} of {}", want.len());
     }
-    assert!(hit_rays > 30, "{hit_rays}");
+    assert!(hit_rays > 60 && left[0] > 10 * left[1] && left[1] > 10, "{hit_rays} {left:?}");
 }
 
 #[test]
