@@ -263,7 +263,7 @@ impl SdfOps for GpuSdf<'_> {
     }
 
     fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {
-        [occupancy.occupied, occupancy.solid] = self.occupancy.read(&self.device)?;
+        occupancy.replace(self.occupancy.read(&self.device)?);
         if let CellRule::Nerfacc(rule) = &self.cells {
             occupancy.history = rule.read(&self.device)?;
         }

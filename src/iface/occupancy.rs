@@ -5,7 +5,7 @@ use crate::field::checkpoint::Checkpoint;
 use rayon::prelude::*;
 use tiface_base::Result;
 use tiface_base::geom::{BitGrid, Ray};
-use tiface_kernels::cpu::march::{self, Samples};
+use tiface_kernels::cpu::march::{MarchCells, Samples};
 use tiface_kernels::cpu::neus;
 use tiface_kernels::cpu::occupancy::{self, BandRule};
 
@@ -20,6 +20,8 @@ pub struct Occupancy {
     allowed: BitGrid,
     /// Decaying maximum of the opacity (`nerfacc` rule), `[cells]`.
     pub history: Vec<f32>,
+    /// Occupied and solid cells, for rays.
+    of_rays: MarchCells,
 }
 
 /// Returns the rule for the width of the band around the zero set.
@@ -65,7 +67,20 @@ impl Occupancy {
             OccupancyRule::Band => Vec::new(),
             OccupancyRule::Nerfacc => vec![0.0; r * r * r],
         };
-        Occupancy { occupied: allowed.clone(), solid: BitGrid::filled(r, false), allowed, history }
+        let solid = BitGrid::filled(r, false);
+        let of_rays = MarchCells::new(&allowed, Some(&solid));
+        Occupancy { occupied: allowed.clone(), solid, allowed, history, of_rays }
+    }
+
+    /// Replaces occupied and solid cells.
+    pub fn replace(&mut self, [occupied, solid]: [BitGrid; 2]) {
+        (self.occupied, self.solid) = (occupied, solid);
+        self.prepare();
+    }
+
+    /// Prepares changed cells for rays.
+    fn prepare(&mut self) {
+        self.of_rays = MarchCells::new(&self.occupied, Some(&self.solid));
     }
 
     /// Writes cells and their history into a checkpoint.
@@ -92,6 +107,7 @@ impl Occupancy {
             *mask = BitGrid::from_words(mask.resolution, bits)
                 .ok_or_else(|| from.mismatch(format!("tensor `{name}` has another size")))?;
         }
+        self.prepare();
         Ok(())
     }
 
@@ -115,6 +131,7 @@ impl Occupancy {
             OccupancyRule::Band => {
                 let cells = [&mut self.occupied, &mut self.solid];
                 occupancy::update_band(cells, &self.allowed, config.radius, band(config), inv_s, field);
+                self.prepare();
             }
             OccupancyRule::Nerfacc => {
                 let opacity = |points: &[[f32; 3]]| -> Vec<f32> {
@@ -137,13 +154,13 @@ impl Occupancy {
     ) {
         let cells = (&mut self.occupied, &mut self.history[..]);
         occupancy::update_nerfacc(cells, &self.allowed, radius, at, threshold, opacity);
+        self.prepare();
     }
 
-    /// Marches rays through the occupied cells, with steps of `dt`; see [`march::march`].
+    /// Marches rays through the occupied cells, with steps of `dt`; see [`MarchCells::march`].
     pub fn march(&self, config: &IfaceConfig, dt: f32, rays: &[Ray], jitter: &[f32]) -> Samples {
-        let solid = (config.occupancy == OccupancyRule::Band).then_some(&self.solid);
         let limit = (3.6 * config.radius / dt) as usize + 2;
-        march::march(&self.occupied, solid, config.radius, dt, rays, jitter, limit)
+        self.of_rays.march(config.radius, dt, rays, jitter, limit)
     }
 
     /// Returns the share of cells that are occupied.

@@ -6,6 +6,7 @@
 //! order.
 
 pub mod adam;
+mod bricks;
 pub mod density;
 pub mod hash;
 pub mod losses;

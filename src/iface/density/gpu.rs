@@ -126,7 +126,8 @@ impl DensityOps for GpuDensity<'_> {
     }
 
     fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {
-        [occupancy.occupied, _] = self.occupancy.read(&self.device)?;
+        let [occupied, _] = self.occupancy.read(&self.device)?;
+        occupancy.replace([occupied, occupancy.solid.clone()]);
         occupancy.history = self.cells.read(&self.device)?;
         self.schedule.next_rays(&self.device, self.stepped.then_some(&self.samples.count))
     }

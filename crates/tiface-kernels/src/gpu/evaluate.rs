@@ -152,8 +152,9 @@ mod tests {
     use super::super::case_tests::Case;
     use super::super::testing::{agree, device};
     use super::*;
+    use crate::cpu::march::MarchCells;
     use crate::cpu::mlp::Weights;
-    use crate::cpu::{march, sdf};
+    use crate::cpu::sdf;
     use tiface_base::math::rng;
 
     #[test]
@@ -199,7 +200,8 @@ mod tests {
                 Ray::new(origin, d)
             })
             .collect();
-        let marched = |rays: &[Ray]| march::march(&mask, None, shape.radius, step, rays, &[], usize::MAX);
+        let cells = MarchCells::new(&mask, None);
+        let marched = |rays: &[Ray]| cells.march(shape.radius, step, rays, &[], usize::MAX);
         assert!(rays.len() > RAYS && marched(&rays[..RAYS]).t.len() > CAPACITY);
         let got = evaluator.render(&rays, step, 1e-4).unwrap();
         assert_eq!(got.len(), rays.len());

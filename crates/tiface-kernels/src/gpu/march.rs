@@ -257,7 +257,8 @@ impl Samples {
         }
     }
 
-    /// Marches rays with steps of length `step_length`, `[1]`: see [`crate::cpu::march::march`].
+    /// Marches rays with steps of length `step_length`, `[1]`: see
+    /// [`crate::cpu::march::MarchCells::march`].
     /// Each ray keeps at most `limit` samples. Rays whose samples exceed the capacity are marked as
     /// not alive. The last `reserved` places of the buffers stay free.
     pub fn march(
@@ -288,7 +289,7 @@ impl Samples {
 mod tests {
     use super::super::testing::{agree, device, planes};
     use super::*;
-    use crate::cpu::march::march;
+    use crate::cpu::march::MarchCells;
     use tiface_base::geom::{BitGrid, Ray};
     use tiface_base::math::rng;
 
@@ -342,7 +343,7 @@ mod tests {
         let Some(device) = device() else { return };
         let (mask, solid, rays, jitter) = scene();
         for (solid, limit) in [(None, 1000), (Some(&solid), 1000), (Some(&solid), 7)] {
-            let want = march(&mask, solid, RADIUS, STEP, &rays, &jitter, limit);
+            let want = MarchCells::new(&mask, solid).march(RADIUS, STEP, &rays, &jitter, limit);
             let n = want.t.len();
             let occupancy = Occupancy::new(&device, &mask, solid, RADIUS);
             let (got, alive) = on_device(&device, &occupancy, (&rays, &jitter), (1 << 16) - 3, limit);

@@ -318,7 +318,9 @@ pub(super) fn scatter(grid: &Grid, gradients: &FactorGradients, gradient: &mut [
             let band_of: Vec<usize> = bands
                 .iter()
                 .enumerate()
-                .flat_map(|(i, band)| std::iter::repeat_n(i, band.values.len() / (band.width * band.channels)))
+                .flat_map(|(i, band)| {
+                    std::iter::repeat_n(i, band.values.len() / (band.width * band.channels))
+                })
                 .collect();
             for (s, cell) in gradients.cells.iter().enumerate() {
                 let row = cell.index[axis] as usize;

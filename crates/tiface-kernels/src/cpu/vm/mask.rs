@@ -7,29 +7,19 @@
 //! depend on the mask.
 
 #[cfg(feature = "wgpu")]
-use crate::cpu::march::BLOCK;
+use crate::cpu::bricks::set_bits;
+use crate::cpu::bricks::{Axes, BrickWalk, Bricks, Found, axes};
 use tiface_base::geom::Ray;
 
-/// Number of cells along the edge of a brick, whose bits are one word.
-const BRICK: usize = 4;
-
 /// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`.
-///
-/// For rays the bits are stored again by bricks, so that a word holds those of the cells around a
-/// point, with the distance to the nearest brick that is not empty.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BoxMask {
     min: [f32; 3],
     max: [f32; 3],
     size: [usize; 3],
     bits: Vec<u64>,
-    /// Number of bricks along each axis.
-    bricks: [usize; 3],
-    /// The bits of each brick's cells, in the order of cells.
-    words: Vec<u64>,
-    /// Of each brick, the number of bricks to the nearest one with an occupied cell, along the axis
-    /// in which they are farthest apart: 0 if the brick itself has one, at most 255.
-    free: Vec<u8>,
+    /// The same bits, for rays.
+    bricks: Bricks,
 }
 
 fn bit(bits: &[u64], i: usize) -> bool {
@@ -39,30 +29,6 @@ fn bit(bits: &[u64], i: usize) -> bool {
 /// Iterates over the cells of a box in the order of their bits.
 fn cells([nx, ny, nz]: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
     (0..nx).flat_map(move |x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])))
-}
-
-/// Returns, of each cell of a box, the number of cells to the nearest one that is `marked`, along
-/// the axis in which they are farthest apart, at most 255.
-///
-/// One pass from each end of the box finds them (Borgefors 1986, "Distance transformations in
-/// digital images").
-fn distances(size: [usize; 3], marked: impl Iterator<Item = bool>) -> Vec<u8> {
-    let mut distance: Vec<u8> = marked.map(|marked| if marked { 0 } else { u8::MAX }).collect();
-    let near = |at: usize, count: usize| at.saturating_sub(1)..(at + 2).min(count);
-    let mut visit = |i: usize, [x, y, z]: [usize; 3]| {
-        for u in near(x, size[0]) {
-            for v in near(y, size[1]) {
-                for w in near(z, size[2]) {
-                    let beside = distance[(u * size[1] + v) * size[2] + w].saturating_add(1);
-                    distance[i] = distance[i].min(beside);
-                }
-            }
-        }
-    };
-    let all: Vec<_> = cells(size).enumerate().collect();
-    all.iter().for_each(|&(i, cell)| visit(i, cell));
-    all.iter().rev().for_each(|&(i, cell)| visit(i, cell));
-    distance
 }
 
 impl BoxMask {
@@ -87,14 +53,8 @@ impl BoxMask {
         if bits.len() != count.div_ceil(64) {
             return None;
         }
-        let bricks = size.map(|n| n.div_ceil(BRICK));
-        let mut words = vec![0; bricks.iter().product()];
-        for [x, y, z] in cells(size).enumerate().filter(|(i, _)| bit(&bits, *i)).map(|(_, c)| c) {
-            let brick = ((x / BRICK) * bricks[1] + y / BRICK) * bricks[2] + z / BRICK;
-            words[brick] |= 1 << ((x % BRICK * BRICK + y % BRICK) * BRICK + z % BRICK);
-        }
-        let free = distances(bricks, words.iter().map(|&word| word != 0));
-        Some(BoxMask { min, max, size, bits, bricks, words, free })
+        let bricks = Bricks::new(size, &bits, &[]);
+        Some(BoxMask { min, max, size, bits, bricks })
     }
 
     /// Creates a mask from marked vertices: a cell is occupied if one of its eight corners is
@@ -137,15 +97,15 @@ impl BoxMask {
         &self.bits
     }
 
-    /// Returns one bit per block of 8³ cells, set if the block contains an occupied cell, in the
+    /// Returns one bit per block of `edge`³ cells, set if the block contains an occupied cell, in the
     /// order of cells.
     #[cfg(feature = "wgpu")]
-    pub fn blocks(&self) -> Vec<u64> {
-        let size = self.size.map(|n| n.div_ceil(BLOCK));
+    pub fn blocks(&self, edge: usize) -> Vec<u64> {
+        let size = self.size.map(|n| n.div_ceil(edge));
         let mut blocks = vec![0; size.iter().product::<usize>().div_ceil(64)];
-        let occupied = cells(self.bricks).zip(&self.words).filter(|(_, word)| **word != 0);
-        for ([x, y, z], _) in occupied {
-            let [x, y, z] = [x, y, z].map(|brick| brick * BRICK / BLOCK);
+        for cell in set_bits(&self.bits) {
+            let [ny, nz] = [self.size[1], self.size[2]];
+            let [x, y, z] = [cell / (ny * nz), cell / nz % ny, cell % nz].map(|c| c / edge);
             let i = (x * size[1] + y) * size[2] + z;
             blocks[i >> 6] |= 1 << (i & 63);
         }
@@ -227,16 +187,12 @@ pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3
     (enter, leave)
 }
 
-/// Values of the three axes, and of a fourth lane that changes nothing, so that each operation is
-/// one instruction.
-type Axes = [f32; 4];
-
 /// Walks over the lattice points of a ray inside the box and inside a mask.
 ///
 /// This is a state rather than a closure, because a closure would be compiled without the vector
 /// instructions of the kernel that calls it.
 pub struct Walk<'a> {
-    mask: Option<(&'a BoxMask, MaskWalk)>,
+    mask: Option<(&'a Bricks, BrickWalk)>,
     origin: Axes,
     direction: Axes,
     /// The field's box, with slack for rounding.
@@ -250,103 +206,24 @@ pub struct Walk<'a> {
     end: i32,
 }
 
-/// What the walk of a ray through a mask needs at each of its points.
-struct MaskWalk {
-    /// Lower corner of the mask.
-    low: Axes,
-    /// Mask cells per unit of length.
-    scale: Axes,
-    /// Number of cells.
-    size: [i32; 4],
-    /// Lattice steps per mask cell; 0 along an axis that the ray does not move along.
-    steps: Axes,
-    /// Infinity along an axis that the ray does not move along, else 0.
-    never: Axes,
-    /// Whether the ray moves up.
-    ahead: [bool; 4],
-}
-
-impl MaskWalk {
-    fn new(mask: &BoxMask, direction: Axes, step: f32) -> MaskWalk {
-        let (low, mut scale) = (axes(mask.min, 0.0), [0f32; 4]);
-        let (mut size, mut steps, mut never) = ([1; 4], [0f32; 4], [f32::INFINITY; 4]);
-        for a in 0..3 {
-            size[a] = mask.size[a] as i32;
-            scale[a] = mask.size[a] as f32 / (mask.max[a] - mask.min[a]);
-            if direction[a] != 0.0 {
-                (steps[a], never[a]) = (1.0 / (direction[a] * scale[a] * step), 0.0);
-            }
-        }
-        MaskWalk { low, scale, size, steps, never, ahead: direction.map(|d| d > 0.0) }
-    }
-
-    /// Returns `None` if the point lies in an occupied cell, or else the number of lattice steps to
-    /// the next point that may lie in one.
-    #[inline(always)]
-    fn skip(&self, mask: &BoxMask, p: &Axes) -> Option<i32> {
-        let (mut g, mut c) = ([0f32; 4], [0i32; 4]);
-        let mut outside = false;
-        for a in 0..4 {
-            g[a] = (p[a] - self.low[a]) * self.scale[a];
-            let top = self.size[a] as f32;
-            // written so that NaN is outside, too
-            outside |= !(g[a] >= -1e-3 && g[a] <= top + 1e-3);
-            // SAFETY: the bounds keep the position, and NaN, in the range of i32.
-            c[a] = unsafe { g[a].max(0.0).min(top - 1.0).to_int_unchecked() };
-        }
-        if outside {
-            return Some(1);
-        }
-        let mut brick = [0i32; 4];
-        for a in 0..4 {
-            brick[a] = c[a] / BRICK as i32;
-        }
-        let at = (brick[0] as usize * mask.bricks[1] + brick[1] as usize) * mask.bricks[2] + brick[2] as usize;
-        let free = i32::from(mask.free[at]);
-        if free == 0 {
-            let within = (c[0] as usize % BRICK * BRICK + c[1] as usize % BRICK) * BRICK + c[2] as usize % BRICK;
-            if mask.words[at] >> within & 1 == 1 {
-                return None;
-            }
-        }
-        // to the border of the empty cell or of the empty bricks around it
-        let mut border = [0f32; 4];
-        for a in 0..4 {
-            let up = if free == 0 { c[a] + 1 } else { (brick[a] + free) * BRICK as i32 };
-            let down = if free == 0 { c[a] } else { (brick[a] + 1 - free) * BRICK as i32 };
-            let wall = if self.ahead[a] { up.min(self.size[a]) } else { down.max(0) };
-            border[a] = (wall as f32 - g[a]) * self.steps[a] + self.never[a];
-        }
-        let steps = border[0].min(border[1]).min(border[2]);
-        // slightly less than that, so that rounding cannot skip a sample in the next cell
-        let whole = (steps - 1e-3).clamp(1.0, 1e9).ceil();
-        // SAFETY: the bounds keep the number, and NaN, in the range of i32.
-        Some(unsafe { whole.max(1.0).to_int_unchecked() })
-    }
-}
-
-/// Returns the values of three axes, with another one in the fourth lane.
-#[inline(always)]
-fn axes([x, y, z]: [f32; 3], fourth: f32) -> Axes {
-    [x, y, z, fourth]
-}
-
 impl<'a> Walk<'a> {
     /// Creates a walk that starts before the first lattice point, which `jitter` shifts by that
     /// part of a step; it has no points if the ray misses the box.
     #[inline(always)]
     pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &Ray, jitter: f32) -> Walk<'a> {
-        let (origin, direction) = (axes(ray.origin.to_array(), 0.0), axes(ray.direction.to_array(), 0.0));
+        let (origin, direction) = (axes(ray.origin.to_array()), axes(ray.direction.to_array()));
         let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
         let (enter, leave) = crossing.unwrap_or((0.0, 0.0));
         let start = enter.clamp(lattice.near, lattice.far) + jitter * lattice.step;
-        let (mut low, mut high) = (axes(lattice.min, 0.0), axes(lattice.max, 0.0));
+        let (mut low, mut high) = (axes(lattice.min), axes(lattice.max));
         for a in 0..3 {
             let slack = 1e-6 * (lattice.max[a] - lattice.min[a]);
             low[a] -= slack;
             high[a] += slack;
         }
-        let mask = mask.map(|mask| (mask, MaskWalk::new(mask, direction, lattice.step)));
+        let of_ray =
+            |m: &'a BoxMask| (&m.bricks, BrickWalk::new(&m.bricks, [m.min, m.max], direction, lattice.step));
+        let mask = mask.map(of_ray);
         let any = crossing.is_some() && start.is_finite();
         let last = lattice.samples.saturating_sub(1).try_into().unwrap_or(i32::MAX);
         // the border itself belongs to the box, and rounding may put a sample just outside
@@ -374,12 +251,16 @@ impl<'a> Walk<'a> {
                 self.k += 1;
                 continue;
             }
-            let skip = self.mask.as_ref().and_then(|(mask, walk)| walk.skip(mask, &p));
-            // a sum beyond the range of numbers is beyond the end, too
-            self.k = self.k.saturating_add(skip.unwrap_or(1));
-            if skip.is_none() {
+            let found = match &self.mask {
+                Some((bricks, walk)) => walk.find(bricks, &p),
+                None => Found::Occupied,
+            };
+            let Found::Empty(steps) = found else {
+                self.k += 1;
                 return Some(t);
-            }
+            };
+            // a sum beyond the range of numbers is beyond the end, too
+            self.k = self.k.saturating_add(steps);
         }
         None
     }

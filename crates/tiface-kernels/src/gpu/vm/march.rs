@@ -6,11 +6,13 @@ use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::{FAR, Span, bit, count_and_write, narrowed, room};
 use super::super::occupancy::u32_words;
 use super::super::vec3::Vec3;
-use crate::cpu::march::BLOCK;
 use crate::cpu::vm::VmField;
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
+
+/// Number of cells along the edge of a block of cells that is skipped as a whole.
+const BLOCK: usize = 8;
 
 /// Offsets in the floats of a lattice: box (6), step, near, far; corner of the mask (3), its cells
 /// per unit of length (3).
@@ -202,7 +204,7 @@ impl DeviceLattice {
             numbers.extend((0..3).map(|a| cells[a] as f32 / (high[a] - low[a])));
             sizes.extend(cells.map(|n| n as u32));
             sizes.extend(cells.map(|n| n.div_ceil(BLOCK) as u32));
-            [mask.bits(), mask.blocks()].map(|bits| device.upload(&u32_words(bits)))
+            [mask.bits(), &mask.blocks(BLOCK)].map(|bits| device.upload(&u32_words(bits)))
         });
         let max_samples = DeviceLattice::max_samples(field);
         DeviceLattice { lattice: device.upload(&numbers), sizes: device.upload(&sizes), mask, max_samples }
