@@ -23,7 +23,7 @@ use tiface::kernel::cpu::adam::{AdamStep, adam};
 use tiface::kernel::cpu::hash;
 use tiface::kernel::cpu::losses::{self, LossWeights, Targets};
 use tiface::kernel::cpu::mlp::{HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, Weights};
-use tiface::kernel::cpu::neus::{self, Segments};
+use tiface::kernel::cpu::neus::{self, ColorRule, Segments};
 use tiface::kernel::cpu::sdf::{self, FieldShape};
 use tiface::math::rng;
 
@@ -81,6 +81,8 @@ fn input() -> Input {
     i
 }
 
+const COLORS: ColorRule = ColorRule { min_weight: 1e-4, group_weight: 0.05 };
+
 const STEP: AdamStep = AdamStep {
     lr: 1e-4,
     beta1: 0.9,
@@ -104,20 +106,21 @@ fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 7]) -> usize 
     let mut a = sdf::geometry(&i.shape, bytemuck::cast_slice(p), &w, &i.x);
     lap(0);
     let segments =
-        Segments { offsets: &i.offsets, direction: &i.directions, t: &i.t, dt: &i.dt, min_weight: 1e-4 };
+        Segments { offsets: &i.offsets, direction: &i.directions, t: &i.t, dt: &i.dt, colors: COLORS };
     let weights = neus::weights(segments, a.output(), 20.0, 0.5);
     lap(1);
-    let shown = neus::shown(&weights, 1e-4);
+    let sources = neus::color_sources(segments, &weights);
+    let shown = neus::shown(&sources);
     let colors = shown.len();
     a.shade(&w, shown, &i.d);
     lap(5);
-    let out = neus::composite(segments, a.output(), &weights);
+    let out = neus::composite(segments, a.output(), &weights, &sources);
     lap(1);
     let targets =
         Targets { offsets: &i.offsets, color: &i.directions, alpha: &i.alpha, background: &i.directions };
     let (_, g_out) = losses::of_rays(&out, targets, &WEIGHTS);
     lap(2);
-    let (mut g_field, _) = neus::backward(segments, a.output(), 20.0, 0.5, &g_out);
+    let (mut g_field, _) = neus::backward(segments, a.output(), &sources, 20.0, 0.5, &g_out);
     lap(1);
     losses::of_samples(a.output(), &WEIGHTS, &mut g_field);
     lap(2);

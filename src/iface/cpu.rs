@@ -3,7 +3,7 @@
 use super::model::shape;
 use super::occupancy::Occupancy;
 use super::ops::{
-    BACKGROUND_STREAM, MAX_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, loss_weights,
+    BACKGROUND_STREAM, MAX_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, color_rule, loss_weights,
     random_background,
 };
 use super::schedule;
@@ -17,7 +17,7 @@ use tiface_base::math::rng;
 use tiface_kernels::cpu::losses::{self, RAY_TERMS, STEREO_STREAM, TERMS, Targets};
 use tiface_kernels::cpu::march::Samples;
 use tiface_kernels::cpu::mlp::Weights;
-use tiface_kernels::cpu::neus::{self, Segments};
+use tiface_kernels::cpu::neus::{self, ColorRule, Segments};
 use tiface_kernels::cpu::pool::Buffer;
 use tiface_kernels::cpu::schedule::Figures;
 use tiface_kernels::cpu::sdf::{self, Activations, FieldShape, WIDTH};
@@ -55,6 +55,8 @@ struct CpuStep {
     along: Vec<[f32; 3]>,
     points: Vec<SurfacePoint>,
     activations: Option<Activations>,
+    /// `[samples]`: the samples that colors are taken from.
+    sources: Vec<u32>,
     composed: Vec<f32>,
     terms: [f32; TERMS],
     /// `[samples + points, 8]`.
@@ -64,9 +66,9 @@ struct CpuStep {
 }
 
 impl CpuStep {
-    fn segments(&self, min_weight: f32) -> Segments<'_> {
+    fn segments(&self, colors: ColorRule) -> Segments<'_> {
         let Samples { offsets, t } = &self.samples;
-        Segments { offsets, direction: &self.direction, t, dt: &self.dts, min_weight }
+        Segments { offsets, direction: &self.direction, t, dt: &self.dts, colors }
     }
 
     fn is_empty(&self) -> bool {
@@ -213,15 +215,15 @@ impl SdfOps for CpuSdf<'_> {
 
     fn neus(&mut self, anneal: f32) {
         let mut activations = self.step.activations.take();
-        let min_weight = self.config.min_weight;
-        let segments = self.step.segments(min_weight);
+        let segments = self.step.segments(color_rule(self.config));
         let weights = neus::weights(segments, output(&activations), self.inv_s, anneal);
+        let sources = neus::color_sources(segments, &weights);
         if let Some(activations) = &mut activations {
             // points have no color: no loss asks for one
-            activations.shade(self.prepared(), neus::shown(&weights, min_weight), &self.step.along);
+            activations.shade(self.prepared(), neus::shown(&sources), &self.step.along);
         }
-        let composed = neus::composite(segments, output(&activations), &weights);
-        (self.step.composed, self.step.activations) = (composed, activations);
+        let composed = neus::composite(segments, output(&activations), &weights, &sources);
+        (self.step.composed, self.step.activations, self.step.sources) = (composed, activations, sources);
     }
 
     fn losses(&mut self, anneal: f32) {
@@ -232,8 +234,9 @@ impl SdfOps for CpuSdf<'_> {
         let (of_rays, g_composed) = losses::of_rays(&step.composed, targets, &w);
         let field = output(&step.activations);
         let n = step.samples.t.len();
+        let segments = step.segments(color_rule(self.config));
         let (mut g_field, g_inv_s) =
-            neus::backward(step.segments(self.config.min_weight), field, self.inv_s, anneal, &g_composed);
+            neus::backward(segments, field, &step.sources, self.inv_s, anneal, &g_composed);
         let (of_samples, of_points) = g_field.split_at_mut(n * WIDTH);
         let of_samples = losses::of_samples(&field[..n * WIDTH], &w, of_samples);
         let points: Vec<[f32; 2]> = step.points.iter().map(|p| [p.footprint, p.weight]).collect();

@@ -5,7 +5,7 @@ use super::infer::DeviceField;
 use super::model::shape;
 use super::occupancy::{Occupancy, band};
 use super::ops::{
-    BACKGROUND_STREAM, MAX_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, loss_weights,
+    BACKGROUND_STREAM, MAX_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, color_rule, loss_weights,
     random_background,
 };
 use super::schedule;
@@ -21,7 +21,7 @@ use tiface_base::geom::Ray;
 use tiface_base::{Error, Result};
 use tiface_kernels::cpu::hash;
 use tiface_kernels::cpu::mlp::TILE;
-use tiface_kernels::cpu::neus::RAY_WIDTH;
+use tiface_kernels::cpu::neus::{ColorRule, RAY_WIDTH};
 use tiface_kernels::cpu::occupancy::OPAQUE;
 use tiface_kernels::cpu::schedule::Figures;
 use tiface_kernels::cpu::sdf::FieldShape;
@@ -103,7 +103,7 @@ impl<'a> GpuSdf<'a> {
             total_count: device.zeros::<u32>(1),
             norm: WeightNorm::new(&device, shape.layout()),
             sdf: Sdf::new(&device, &shape, capacity),
-            neus: Neus::new(&device, rays, capacity, config.min_weight),
+            neus: Neus::new(&device, rays, capacity, color_rule(config)),
             losses: Losses::new(&device, weights, rays, capacity),
             flat: device.zeros::<f32>(flat),
             g_flat: device.zeros::<f32>(flat),
@@ -370,8 +370,8 @@ impl DeviceField for gpu::Evaluator {
         gpu::Evaluator::evaluate(self, points, directions, normals, channels)
     }
 
-    fn render(&mut self, rays: &[Ray], dt: f32, min_weight: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
-        gpu::Evaluator::render(self, rays, dt, min_weight)
+    fn render(&mut self, rays: &[Ray], dt: f32, colors: ColorRule) -> Result<Vec<[f32; RAY_WIDTH]>> {
+        gpu::Evaluator::render(self, rays, dt, colors)
     }
 }
 

@@ -15,7 +15,7 @@ use tiface_base::Result;
 use tiface_base::geom::{BitGrid, Ray, RayResult, SdfField};
 use tiface_base::io::Lock;
 use tiface_kernels::cpu::mlp::Weights;
-use tiface_kernels::cpu::neus::{self, Segments};
+use tiface_kernels::cpu::neus::{self, ColorRule, Segments};
 use tiface_kernels::cpu::sdf::{self, FieldShape, WIDTH};
 
 /// The field on a device. Points, directions and normals are `[n, 3]`, in the network's
@@ -31,7 +31,7 @@ pub(super) trait DeviceField: Send {
     ) -> Result<Vec<Vec<f32>>>;
 
     /// Returns the composited rays of a volume render with samples `dt` apart.
-    fn render(&mut self, rays: &[Ray], dt: f32, min_weight: f32) -> Result<Vec<[f32; neus::RAY_WIDTH]>>;
+    fn render(&mut self, rays: &[Ray], dt: f32, colors: ColorRule) -> Result<Vec<[f32; neus::RAY_WIDTH]>>;
 }
 
 /// The trained field on the host. All positions and distances are in scene units, the box is [-1,
@@ -202,11 +202,16 @@ impl IFace {
         rays.chunks(PASS).flat_map(|rays| self.render_pass(rays)).collect()
     }
 
+    /// Returns which samples have colors: in a render each has its own, so that rays may be
+    /// evaluated in pieces.
+    fn color_rule(&self) -> ColorRule {
+        ColorRule { min_weight: self.config.min_weight, group_weight: 0.0 }
+    }
+
     fn render_pass(&self, rays: &[Ray]) -> Vec<RayResult> {
         let dt = step_length(&self.config).at(self.inv_s);
         let marched: Vec<Ray> = rays.iter().map(|r| r.scaled(self.config.radius)).collect();
-        if let Some(composited) = self.on_gpu.ask(|field| field.render(&marched, dt, self.config.min_weight))
-        {
+        if let Some(composited) = self.on_gpu.ask(|field| field.render(&marched, dt, self.color_rule())) {
             return composited.iter().map(|o| self.result(o)).collect();
         }
         self.composite(&marched, dt).iter().map(|o| self.result(o)).collect()
@@ -237,15 +242,16 @@ impl IFace {
             }
             let mut field = sdf::geometry(&self.shape, self.table(), &self.weights, &x);
             let direction: Vec<[f32; 3]> = open.iter().map(|&(r, _)| rays[r].direction.to_array()).collect();
-            let (dt, min_weight) = (&vec![dt; t.len()], self.config.min_weight);
-            let pieces = Segments { offsets: &offsets, direction: &direction, t: &t, dt, min_weight };
+            let (dt, colors) = (&vec![dt; t.len()], self.color_rule());
+            let pieces = Segments { offsets: &offsets, direction: &direction, t: &t, dt, colors };
             let mut weights = neus::weights(pieces, field.output(), self.inv_s, 1.0);
             for (i, &(r, _)) in open.iter().enumerate() {
                 let light = 1.0 - out[r][3];
                 weights[offsets[i] as usize..offsets[i + 1] as usize].iter_mut().for_each(|w| *w *= light);
             }
-            field.shade(&self.weights, neus::shown(&weights, min_weight), &d);
-            let composited = neus::composite(pieces, field.output(), &weights);
+            let sources = neus::color_sources(pieces, &weights);
+            field.shade(&self.weights, neus::shown(&sources), &d);
+            let composited = neus::composite(pieces, field.output(), &weights, &sources);
             let mut pieces = composited.as_chunks::<{ neus::RAY_WIDTH }>().0.iter();
             open.retain_mut(|(r, k)| {
                 let out = &mut out[*r];

@@ -73,6 +73,7 @@ impl Occupancy {
     }
 
     /// Replaces occupied and solid cells.
+    #[cfg(feature = "wgpu")]
     pub fn replace(&mut self, [occupied, solid]: [BitGrid; 2]) {
         (self.occupied, self.solid) = (occupied, solid);
         self.prepare();

@@ -8,6 +8,7 @@ use crate::field::parameters::ParameterGroup;
 use crate::field::training::StepAt;
 use tiface_base::Result;
 use tiface_kernels::cpu::losses::LossWeights;
+use tiface_kernels::cpu::neus::ColorRule;
 use tiface_kernels::cpu::schedule::Figures;
 
 /// Distance from a stereo point, in pixels, at which the loss changes from quadratic to linear:
@@ -41,6 +42,11 @@ pub fn loss_weights(config: &IfaceConfig, masked: bool) -> LossWeights {
         stereo: config.stereo as f32,
         knee: KNEE,
     }
+}
+
+/// Returns which samples of a ray have colors in training.
+pub fn color_rule(config: &IfaceConfig) -> ColorRule {
+    ColorRule { min_weight: config.min_weight, group_weight: config.group_weight }
 }
 
 /// Returns whether rays are composited over random colors.

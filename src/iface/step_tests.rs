@@ -161,13 +161,8 @@ fn formulas(
     let n = t.len();
     assert!(n > 150, "{n} samples");
     let steps = vec![dt as f32; n];
-    let segments = Segments {
-        offsets: &offsets,
-        direction: &direction,
-        t: &t,
-        dt: &steps,
-        min_weight: config.min_weight,
-    };
+    let segments =
+        Segments { offsets: &offsets, direction: &direction, t: &t, dt: &steps, colors: color_rule(config) };
     let anneal = step as f64 / (config.anneal_end * config.steps as f64).round();
     let seen = neus::composite(segments, &outputs, inv_s, anneal);
     // Σ w ‖c − head‖²: the same compositing of what each sample is off

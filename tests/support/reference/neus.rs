@@ -12,6 +12,8 @@ pub(crate) fn composite<R: Real>(segments: Segments, field: &[R], inv_s: R, anne
     for r in 0..segments.offsets.len() - 1 {
         let mut out = [of(0.0); RAY_WIDTH];
         let mut transmittance = of(1.0);
+        // weights and colors of the samples whose color counts
+        let mut counting = Vec::new();
         for s in segments.offsets[r] as usize..segments.offsets[r + 1] as usize {
             let f = &field[s * WIDTH..][..WIDTH];
             let length = (f[1] * f[1] + f[2] * f[2] + f[3] * f[3]).sqrt();
@@ -24,11 +26,8 @@ pub(crate) fn composite<R: Real>(segments: Segments, field: &[R], inv_s: R, anne
             let (p, q) = (sigmoid((f[0] - half) * sharp), sigmoid((f[0] + half) * sharp));
             let alpha = ((p - q + of(1e-5)) / (p + of(1e-5))).within(0.0, 1.0);
             let w = transmittance * alpha;
-            if w.value() > segments.min_weight.into() {
-                for c in 0..3 {
-                    out[c] += w * f[4 + c];
-                }
-                out[8] += w * (f[4] * f[4] + f[5] * f[5] + f[6] * f[6]);
+            if w.value() > segments.colors.min_weight.into() {
+                counting.push((w, [f[4], f[5], f[6]]));
             }
             for c in 0..3 {
                 out[5 + c] += w * n[c];
@@ -36,6 +35,34 @@ pub(crate) fn composite<R: Real>(segments: Segments, field: &[R], inv_s: R, anne
             out[3] += w;
             out[4] += w * of(segments.t[s] as f64);
             transmittance = transmittance * (of(1.0) - alpha);
+        }
+        // groups that are full, and what is left at the end
+        let full = |group: &[(R, [R; 3])]| {
+            group.iter().map(|(w, _)| w.value()).sum::<f64>() >= f64::from(segments.colors.group_weight)
+        };
+        let mut groups: Vec<Vec<(R, [R; 3])>> = vec![Vec::new()];
+        for sample in counting {
+            if groups.last().is_some_and(|group| full(group)) {
+                groups.push(Vec::new());
+            }
+            groups.last_mut().unwrap().push(sample);
+        }
+        let mut before = None;
+        for group in groups.iter().filter(|group| !group.is_empty()) {
+            let mut heaviest = group[0];
+            group.iter().for_each(|other| {
+                if other.0.value() > heaviest.0.value() {
+                    heaviest = *other;
+                }
+            });
+            let color = before.filter(|_| !full(group)).unwrap_or(heaviest.1);
+            for (w, _) in group {
+                for c in 0..3 {
+                    out[c] += *w * color[c];
+                }
+                out[8] += *w * (color[0] * color[0] + color[1] * color[1] + color[2] * color[2]);
+            }
+            before = Some(color);
         }
         all.extend(out);
     }

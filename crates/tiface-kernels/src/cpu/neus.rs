@@ -13,14 +13,16 @@
 //! The last column of the field's output is `ln(s / inv_s)` of the sample; in NeuS it is 0
 //! everywhere.
 //!
-//! A sample whose weight is at most [`Segments::min_weight`] counts as black, so its color is not
-//! evaluated; its opacity counts.
+//! A sample whose weight is at most [`ColorRule::min_weight`] counts as black, so its color is not
+//! evaluated; its opacity counts. Neighbors may share a color: see [`ColorRule::group_weight`].
 
 use super::hash::{LANES, Lanes};
+use super::march::COLORLESS;
 use super::pool::Buffer;
 use super::sdf::WIDTH;
 use super::simd::{exp, sigmoid_and_complement};
 use rayon::prelude::*;
+use std::ops::Range;
 use tiface_base::dispatch;
 
 /// Number of values per ray: rgb (3), opacity, depth (Σ w t), normal (3, Σ w n̂), squared color (Σ
@@ -38,8 +40,19 @@ pub struct Segments<'a> {
     pub t: &'a [f32],
     /// `[samples]` lengths.
     pub dt: &'a [f32],
+    /// Which samples have colors.
+    pub colors: ColorRule,
+}
+
+/// Which samples of a ray have a color, and which of them share one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ColorRule {
     /// Weight along the ray above which the color of a sample counts.
     pub min_weight: f32,
+    /// Neighboring samples of a ray share a color, that of the heaviest of them, until their
+    /// weights sum to this; what is left at the end of a ray takes the color before it. At 0 each
+    /// sample has its own.
+    pub group_weight: f32,
 }
 
 const EPSILON: f32 = 1e-5;
@@ -99,12 +112,19 @@ fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Returns the values of a sample that are composited, before they are multiplied by its weight; it
-/// is black unless its color counts.
+/// Returns the values of a sample that are composited, before they are multiplied by its weight.
 #[inline]
-fn values_of(field: &[f32], counts: bool, n: [f32; 3], t: f32) -> [f32; RAY_WIDTH] {
-    let [r, g, b] = if counts { [field[4], field[5], field[6]] } else { [0.0; 3] };
+fn values_of([r, g, b]: [f32; 3], n: [f32; 3], t: f32) -> [f32; RAY_WIDTH] {
     [r, g, b, 1.0, t, n[0], n[1], n[2], r * r + g * g + b * b]
+}
+
+/// Returns the color in the row `source` of the field's output, or black for [`COLORLESS`].
+#[inline]
+fn color_of(field: &[f32], source: u32) -> [f32; 3] {
+    match source {
+        COLORLESS => [0.0; 3],
+        _ => std::array::from_fn(|c| field[source as usize * WIDTH + 4 + c]),
+    }
 }
 
 /// What compositing derives from the field's output at [`LANES`] samples of a ray.
@@ -156,7 +176,7 @@ fn block<const F: bool>(field: &[f32], dt: &[f32], direction: [f32; 3], inv_s: f
 const RAYS: usize = 64;
 
 /// Splits the rows of samples, `width` long, into those of each task, with its first ray.
-fn by_task<'a>(offsets: &[i32], mut rows: &'a mut [f32], width: usize) -> Vec<(usize, &'a mut [f32])> {
+fn by_task<'a, T>(offsets: &[i32], mut rows: &'a mut [T], width: usize) -> Vec<(usize, &'a mut [T])> {
     let rays = offsets.len() - 1;
     let mut cut = |first: usize| {
         let samples = (offsets[(first + RAYS).min(rays)] - offsets[first]) as usize;
@@ -167,7 +187,7 @@ fn by_task<'a>(offsets: &[i32], mut rows: &'a mut [f32], width: usize) -> Vec<(u
 
 /// Rays of a task whose first is `first`, with the ranges of their samples.
 #[inline(always)]
-fn rays_of(segments: Segments<'_>, first: usize) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> {
+fn rays_of(segments: Segments<'_>, first: usize) -> impl Iterator<Item = (usize, Range<usize>)> {
     let end = (first + RAYS).min(segments.offsets.len() - 1);
     (first..end).map(move |r| (r, segments.offsets[r] as usize..segments.offsets[r + 1] as usize))
 }
@@ -217,9 +237,54 @@ pub fn weights(segments: Segments, field: &[f32], inv_s: f32, anneal: f32) -> Ve
     weights
 }
 
-/// Returns the samples whose weight is above `min_weight`, ascending.
-pub fn shown(weights: &[f32], min_weight: f32) -> Vec<u32> {
-    (0..weights.len() as u32).filter(|&s| weights[s as usize] > min_weight).collect()
+/// Returns, for each sample, the sample whose color it takes: see [`ColorRule`]. Samples whose color
+/// does not count have [`COLORLESS`].
+///
+/// # Shapes
+///
+/// - weights: `[samples]`, as [`weights`] returns them
+pub fn color_sources(segments: Segments, weights: &[f32]) -> Vec<u32> {
+    let mut sources = vec![COLORLESS; weights.len()];
+    by_task(segments.offsets, &mut sources, 1).into_par_iter().for_each(|(first, sources)| {
+        let begin = segments.offsets[first] as usize;
+        for (_, span) in rays_of(segments, first) {
+            let own = span.start - begin..span.end - begin;
+            share_colors(segments.colors, &weights[span.clone()], span.start as u32, &mut sources[own]);
+        }
+    });
+    sources
+}
+
+/// As [`color_sources`], of a ray whose first sample has the index `begin`.
+fn share_colors(rule: ColorRule, weights: &[f32], begin: u32, sources: &mut [u32]) {
+    let counts = |s: &usize| weights[*s] > rule.min_weight;
+    // of the samples since `start`: their weight, and the heaviest
+    let (mut start, mut group, mut heaviest) = (0, 0f32, None);
+    let mut before = None;
+    let mut give = |samples: Range<usize>, from: usize| {
+        samples.filter(counts).for_each(|s| sources[s] = begin + from as u32);
+    };
+    for s in (0..weights.len()).filter(counts) {
+        group += weights[s];
+        let from = heaviest.filter(|&h: &usize| weights[h] >= weights[s]).unwrap_or(s);
+        heaviest = Some(from);
+        if group >= rule.group_weight {
+            give(start..s + 1, from);
+            (start, group, heaviest, before) = (s + 1, 0.0, None, Some(from));
+        }
+    }
+    if let Some(from) = before.or(heaviest) {
+        give(start..weights.len(), from);
+    }
+}
+
+/// Returns the samples whose color is taken by some sample, ascending.
+///
+/// # Shapes
+///
+/// - sources: `[samples]`, as [`color_sources`] returns them
+pub fn shown(sources: &[u32]) -> Vec<u32> {
+    (0..sources.len() as u32).filter(|&s| sources[s as usize] == s).collect()
 }
 
 /// Composites the samples of each ray by their weights. The values of a ray without samples are
@@ -228,15 +293,16 @@ pub fn shown(weights: &[f32], min_weight: f32) -> Vec<u32> {
 /// # Shapes
 ///
 /// - field: `[samples, 8]`, the output of the field; weights: `[samples]`
+/// - sources: `[samples]`, as [`color_sources`] returns them
 /// - output: `[rays, 9]` = rgb, opacity, Σ w t, Σ w n̂, Σ w ‖rgb‖²
-pub fn composite(segments: Segments, field: &[f32], weights: &[f32]) -> Vec<f32> {
+pub fn composite(segments: Segments, field: &[f32], weights: &[f32], sources: &[u32]) -> Vec<f32> {
     let count = segments.offsets.len() - 1;
     let mut out = vec![0f32; count * RAY_WIDTH];
     out.par_chunks_mut(RAY_WIDTH).with_min_len(64).enumerate().for_each(|(r, out)| {
         for s in segments.offsets[r] as usize..segments.offsets[r + 1] as usize {
-            let (f, w) = (&field[s * WIDTH..][..WIDTH], weights[s]);
-            let values = values_of(f, w > segments.min_weight, normal_of(f), segments.t[s]);
-            out.iter_mut().zip(values).for_each(|(out, value)| *out += w * value);
+            let normal = normal_of(&field[s * WIDTH..][..WIDTH]);
+            let values = values_of(color_of(field, sources[s]), normal, segments.t[s]);
+            out.iter_mut().zip(values).for_each(|(out, value)| *out += weights[s] * value);
         }
     });
     out
@@ -244,7 +310,8 @@ pub fn composite(segments: Segments, field: &[f32], weights: &[f32]) -> Vec<f32>
 
 /// Composites the samples of each ray: [`composite`] by [`weights`].
 pub fn forward(segments: Segments, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
-    composite(segments, field, &weights(segments, field, inv_s, anneal))
+    let weights = weights(segments, field, inv_s, anneal);
+    composite(segments, field, &weights, &color_sources(segments, &weights))
 }
 
 /// The backward pass of some rays.
@@ -259,7 +326,7 @@ struct NeusBackwardTask<'a> {
 fn backward_body<const F: bool>(
     t: &mut NeusBackwardTask,
     segments: Segments,
-    field: &[f32],
+    (field, sources): (&[f32], &[u32]),
     inv_s: f32,
     anneal: f32,
     g_out: &[f32],
@@ -290,19 +357,20 @@ fn backward_body<const F: bool>(
             let (alpha, transmittance) = (b.raw[i].clamp(0.0, 1.0), transmittance[i]);
             let normal = [b.normal[0][i], b.normal[1][i], b.normal[2][i]];
             let w = transmittance * alpha;
-            let counts = w > segments.min_weight;
             let row = &field[s * WIDTH..][..WIDTH];
+            let color = color_of(field, sources[s]);
             // the loss gradient by the weight
             let mut g_w = 0f32;
-            for (g, value) in g.iter().zip(values_of(row, counts, normal, segments.t[s])) {
+            for (g, value) in g.iter().zip(values_of(color, normal, segments.t[s])) {
                 g_w += g * value;
             }
-            let out = &mut t.g_field[(s - begin) * WIDTH..][..WIDTH];
-            if counts {
+            if sources[s] != COLORLESS {
+                let out = &mut t.g_field[(sources[s] as usize - begin) * WIDTH + 4..][..3];
                 for c in 0..3 {
-                    out[4 + c] = w * (g[c] + 2.0 * g[8] * row[4 + c]);
+                    out[c] += w * (g[c] + 2.0 * g[8] * color[c]);
                 }
             }
+            let out = &mut t.g_field[(s - begin) * WIDTH..][..WIDTH];
             let g_alpha = transmittance * g_w - farther / (1.0 - alpha).max(1e-10);
             farther += w * g_w;
             // the gradient by the unit normal has two parts: as composited, and through the cosine
@@ -340,7 +408,8 @@ fn backward_body<const F: bool>(
 
 dispatch! {
     fn backward_task / backward_body(
-        t: &mut NeusBackwardTask, segments: Segments, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32],
+        t: &mut NeusBackwardTask, segments: Segments, field_and_sources: (&[f32], &[u32]), inv_s: f32,
+        anneal: f32, g_out: &[f32],
     )
 }
 
@@ -349,15 +418,23 @@ dispatch! {
 /// # Shapes
 ///
 /// - field: `[n, 8]`, the output of the field; the gradient of rows beyond the samples is zero
-/// - g_out: `[rays, 9]`, the gradient of the loss with respect to the output of [`forward`]
-pub fn backward(segments: Segments, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32]) -> (Buffer, f32) {
+/// - sources: `[samples]`, as [`color_sources`] returns them
+/// - g_out: `[rays, 9]`, the gradient of the loss with respect to the output of [`composite`]
+pub fn backward(
+    segments: Segments,
+    field: &[f32],
+    sources: &[u32],
+    inv_s: f32,
+    anneal: f32,
+    g_out: &[f32],
+) -> (Buffer, f32) {
     let clamped = inv_s.clamp(1e-6, 1e6);
     let mut g_field = Buffer::zeroed(field.len());
     let mut tasks: Vec<NeusBackwardTask> = by_task(segments.offsets, &mut g_field, WIDTH)
         .into_iter()
         .map(|(first, g_field)| NeusBackwardTask { first, g_field, g_ln_inv_s: Vec::with_capacity(RAYS) })
         .collect();
-    tasks.par_iter_mut().for_each(|t| backward_task(t, segments, field, clamped, anneal, g_out));
+    tasks.par_iter_mut().for_each(|t| backward_task(t, segments, (field, sources), clamped, anneal, g_out));
     let total: f64 = tasks.iter().flat_map(|t| &t.g_ln_inv_s).sum();
     let inside = (1e-6..=1e6).contains(&inv_s);
     (g_field, if inside { (total / inv_s as f64) as f32 } else { 0.0 })
@@ -393,8 +470,8 @@ mod tests {
     fn extreme_fields_have_finite_opacities_and_bounded_gradients() {
         let offsets = [0, 4];
         let (direction, t, dt) = ([[0.6, 0.0, -0.8]], [1.0, 1.1, 1.2, 1.3], [1e-9, 0.05, 3.0, 1e3]);
-        let segments =
-            Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, min_weight: 1e-4 };
+        let colors = ColorRule { min_weight: 1e-4, group_weight: 0.05 };
+        let segments = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, colors };
         let g = [1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0];
         for inv_s in [0.0, 1e-9, 1e-6, 1.0, 1e6, 1e9, f32::INFINITY] {
             for sdf in [0.0, 1e-30, -1e-6, 1.0, -1e3, 1e20] {
@@ -406,7 +483,7 @@ mod tests {
                         composited.iter().all(|v| v.is_finite() && v.abs() < 2.0),
                         "{inv_s} {sdf} {slope} {composited:?}"
                     );
-                    let (g_field, g_s) = backward(segments, &field, inv_s, 1.0, &g);
+                    let (g_field, g_s) = gradients(segments, &field, inv_s, 1.0, &g);
                     let gradients = || g_field.iter().chain([&g_s]);
                     assert!(gradients().all(|v| v.is_finite()), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
                     // 3 · 1e6, the unit normal's 1 / MIN_GRADIENT_NORM, and 1e3 · 1e6 by the length
@@ -418,6 +495,35 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// Returns the gradients of the last forward pass.
+    fn gradients(segments: Segments, field: &[f32], inv_s: f32, anneal: f32, g: &[f32]) -> (Buffer, f32) {
+        let sources = color_sources(segments, &weights(segments, field, inv_s, anneal));
+        backward(segments, field, &sources, inv_s, anneal, g)
+    }
+
+    #[test]
+    fn samples_share_the_color_of_the_heaviest_until_their_weights_sum_to_that_of_a_group() {
+        const NONE: u32 = COLORLESS;
+        let rule = |group_weight| ColorRule { min_weight: 1e-4, group_weight };
+        // (weight of a group, weights, sources of a ray whose first sample is 10)
+        let cases: [(f32, &[f32], &[u32]); 6] = [
+            (0.0, &[0.3, 0.0, 0.2], &[10, NONE, 12]),
+            (0.05, &[0.02, 1e-5, 0.03, 0.3, 0.04, 0.02], &[12, NONE, 12, 13, 14, 14]),
+            // what is left takes the color before it, even where it is heavier
+            (0.05, &[0.06, 0.01, 0.02], &[10, 10, 10]),
+            (0.5, &[0.1, 0.3, 0.2, 0.4], &[11, 11, 11, 11]),
+            // a ray of less than a group
+            (0.5, &[0.1, 0.2, 1e-4, 0.1], &[11, 11, NONE, 11]),
+            (0.5, &[1e-4, 1e-5], &[NONE, NONE]),
+        ];
+        for (group_weight, weights, want) in cases {
+            let mut sources = vec![COLORLESS; weights.len()];
+            share_colors(rule(group_weight), weights, 10, &mut sources);
+            assert_eq!(sources, want, "{group_weight} {weights:?}");
+        }
+        assert_eq!(shown(&[2, NONE, 2, 3, 3]), [2, 3]);
     }
 
     /// Returns Σ g · out, by the formulas in f64.
@@ -432,8 +538,6 @@ mod tests {
         let direction = [[0.6, 0.0, -0.8], [0.0, 0.0, 1.0], [0.36, -0.48, 0.8]];
         let t: Vec<f32> = (0..12).map(|i| 1.0 + 0.05 * i as f32).collect();
         let dt = vec![0.05f32; 12];
-        let segments =
-            Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, min_weight: 1e-4 };
         let field: Vec<f32> = (0..96)
             .map(|i| match i % 8 {
                 // so far outside that its color does not count
@@ -446,24 +550,28 @@ mod tests {
             .collect();
         let g: Vec<f32> = (0..27).map(|i| (i as f32 * 0.9).sin()).collect();
         let (inv_s, anneal) = (30f32, 0.4f32);
-        let (g_field, g_s) = backward(segments, &field, inv_s, anneal, &g);
-        let faint = |w: &f32| *w <= segments.min_weight;
-        assert!(faint(&weights(segments, &field, inv_s, anneal)[4]) && g_field[36..39] == [0.0; 3]);
-        assert!(g_field[32] != 0.0, "its opacity counts");
-        let wide = reference::wide(&field);
-        let at = |f: &[f64], s: f64| loss(segments, f, s, anneal as f64, &g);
-        let scale = g_field.iter().fold(0f32, |a, &b| a.max(b.abs())) as f64;
-        for i in 0..96 {
-            let mut f = wide.clone();
-            f[i] += 1e-6;
-            let up = at(&f, inv_s as f64);
-            f[i] -= 2e-6;
-            let slope = (up - at(&f, inv_s as f64)) / 2e-6;
-            let error = (slope - g_field[i] as f64).abs() / slope.abs().max(1e-3 * scale);
-            assert!(error < 1e-3, "field {i}: {slope} {}", g_field[i]);
+        for group_weight in [0.0, 0.1] {
+            let colors = ColorRule { min_weight: 1e-4, group_weight };
+            let segments = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, colors };
+            let (g_field, g_s) = gradients(segments, &field, inv_s, anneal, &g);
+            let faint = |w: &f32| *w <= colors.min_weight;
+            assert!(faint(&weights(segments, &field, inv_s, anneal)[4]) && g_field[36..39] == [0.0; 3]);
+            assert!(g_field[32] != 0.0, "its opacity counts");
+            let wide = reference::wide(&field);
+            let at = |f: &[f64], s: f64| loss(segments, f, s, anneal as f64, &g);
+            let scale = g_field.iter().fold(0f32, |a, &b| a.max(b.abs())) as f64;
+            for i in 0..96 {
+                let mut f = wide.clone();
+                f[i] += 1e-6;
+                let up = at(&f, inv_s as f64);
+                f[i] -= 2e-6;
+                let slope = (up - at(&f, inv_s as f64)) / 2e-6;
+                let error = (slope - g_field[i] as f64).abs() / slope.abs().max(1e-3 * scale);
+                assert!(error < 1e-3, "{group_weight}, field {i}: {slope} {}", g_field[i]);
+            }
+            let slope = (at(&wide, inv_s as f64 + 1e-4) - at(&wide, inv_s as f64 - 1e-4)) / 2e-4;
+            assert!((slope - g_s as f64).abs() < 1e-3 * slope.abs(), "inv_s {slope} {g_s}");
+            assert_eq!(&forward(segments, &field, inv_s, anneal)[9..18], &[0.0; 9]);
         }
-        let slope = (at(&wide, inv_s as f64 + 1e-4) - at(&wide, inv_s as f64 - 1e-4)) / 2e-4;
-        assert!((slope - g_s as f64).abs() < 1e-3 * slope.abs(), "inv_s {slope} {g_s}");
-        assert_eq!(&forward(segments, &field, inv_s, anneal)[9..18], &[0.0; 9]);
     }
 }

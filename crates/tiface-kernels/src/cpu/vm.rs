@@ -26,8 +26,6 @@ pub use gather::Cell;
 pub use penalty::penalize;
 #[cfg(feature = "wgpu")]
 pub(crate) use penalty::tv_factors;
-#[cfg(feature = "wgpu")]
-pub(crate) use render::COLORLESS;
 pub use render::{RAY_WIDTH, Rendered, Shading, VmField, backward, density_at, render};
 pub use resize::{cropped, resized};
 

@@ -6,7 +6,7 @@ use super::march::Samples;
 use super::neus::Neus;
 use super::occupancy::Occupancy;
 use super::sdf::Sdf;
-use crate::cpu::neus::RAY_WIDTH;
+use crate::cpu::neus::{ColorRule, RAY_WIDTH};
 use crate::cpu::sdf::FieldShape;
 use std::ops::Range;
 use tiface_base::Result;
@@ -122,11 +122,11 @@ impl Evaluator {
     }
 
     /// Renders rays with march steps of `step`, and returns `[rays, 9]`: see
-    /// [`crate::cpu::neus::forward`]. All calls have the same `min_weight`.
-    pub fn render(&mut self, rays: &[Ray], step: f32, min_weight: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
+    /// [`crate::cpu::neus::forward`]. All calls have the same `colors`.
+    pub fn render(&mut self, rays: &[Ray], step: f32, colors: ColorRule) -> Result<Vec<[f32; RAY_WIDTH]>> {
         let device = &self.device;
         let step = device.upload(&[step]);
-        let made = || (Samples::new(device, RAYS, CAPACITY), Neus::new(device, RAYS, CAPACITY, min_weight));
+        let made = || (Samples::new(device, RAYS, CAPACITY), Neus::new(device, RAYS, CAPACITY, colors));
         let (samples, neus) = self.rays.get_or_insert_with(made);
         let mut out = Vec::with_capacity(rays.len());
         while out.len() < rays.len() {
@@ -201,9 +201,10 @@ mod tests {
             })
             .collect();
         let cells = MarchCells::new(&mask, None);
+        let colors = ColorRule { min_weight: 1e-4, group_weight: 0.05 };
         let marched = |rays: &[Ray]| cells.march(shape.radius, step, rays, &[], usize::MAX);
         assert!(rays.len() > RAYS && marched(&rays[..RAYS]).t.len() > CAPACITY);
-        let got = evaluator.render(&rays, step, 1e-4).unwrap();
+        let got = evaluator.render(&rays, step, colors).unwrap();
         assert_eq!(got.len(), rays.len());
         let some: Vec<usize> = (0..rays.len()).step_by(7).collect();
         let few: Vec<Ray> = some.iter().map(|&r| rays[r]).collect();
@@ -217,7 +218,7 @@ mod tests {
             direction: &along,
             t: &samples.t,
             dt: &dt,
-            min_weight: 1e-4,
+            colors,
         };
         let want = crate::cpu::neus::forward(segments, field.output(), 20.0, 1.0);
         let got: Vec<[f32; RAY_WIDTH]> = some.iter().map(|&r| got[r]).collect();

@@ -6,7 +6,8 @@ use super::device::{Buffer, Device, Words, groups, launch};
 use super::march::Samples;
 use super::sum::group_sum;
 use super::vec3::Vec3;
-use crate::cpu::neus::MIN_GRADIENT_NORM;
+use crate::cpu::march::COLORLESS;
+use crate::cpu::neus::{ColorRule, MIN_GRADIENT_NORM};
 use crate::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
 
@@ -115,7 +116,18 @@ fn sample(
     }
 }
 
-/// Composites rays, and writes the transmittance at each sample to `light`.
+/// Gives the samples of a range that have a color the color of sample `from`.
+#[cube]
+fn give(sources: &mut [u32], start: usize, end: usize, from: usize) {
+    for s in start..end {
+        if sources[s] != COLORLESS {
+            sources[s] = from as u32;
+        }
+    }
+}
+
+/// Composites rays, and writes the transmittance at each sample to `light` and the sample whose color
+/// it takes to `sources`.
 #[cube(launch)]
 fn forward(
     offsets: &[u32],
@@ -126,8 +138,10 @@ fn forward(
     inv_s: &[f32],
     out: &mut [f32],
     light: &mut [f32],
+    sources: &mut [u32],
     anneal: f32,
     min_weight: f32,
+    group_weight: f32,
 ) {
     let rays = direction.len() / 3;
     let plane = t.len();
@@ -139,17 +153,48 @@ fn forward(
         let mut sums = Composited::empty();
         let mut normal = Vec3::zero();
         let mut squares = 0.0f32;
-        for s in (offsets[r] as usize)..(offsets[r + 1] as usize) {
+        let (begin, end) = (offsets[r] as usize, offsets[r + 1] as usize);
+        // of the samples since `start`: their weight, and the heaviest with its own
+        let mut start = begin;
+        let mut group = 0.0f32;
+        let mut heaviest = begin;
+        let mut most = 0.0f32;
+        // the color of the last group that was full
+        let mut before = end;
+        for s in begin..end {
             let a = sample(field, plane, s, dt[s], d, inv_s, anneal);
             let w = transmittance * a.alpha;
-            let shown = select(w > min_weight, w, 0.0f32);
-            let color = Vec3::read(field, plane, 4 * plane + s);
-            sums.rgb.add_weighted(shown, color);
-            squares += shown * color.dot(color);
+            sources[s] = COLORLESS;
+            if w > min_weight {
+                sources[s] = s as u32;
+                group += w;
+                if w > most {
+                    most = w;
+                    heaviest = s;
+                }
+                if group >= group_weight {
+                    give(sources, start, s + 1, heaviest);
+                    let color = Vec3::read(field, plane, 4 * plane + heaviest);
+                    sums.rgb.add_weighted(group, color);
+                    squares += group * color.dot(color);
+                    start = s + 1;
+                    group = 0.0f32;
+                    most = 0.0f32;
+                    before = heaviest;
+                }
+            }
             sums.add(w, t[s]);
             normal.add_weighted(w, a.normal);
             light[s] = transmittance;
             transmittance *= 1.0f32 - a.alpha;
+        }
+        if group > 0.0f32 {
+            // what is left takes the color before it
+            heaviest = select(before < end, before, heaviest);
+            give(sources, start, end, heaviest);
+            let color = Vec3::read(field, plane, 4 * plane + heaviest);
+            sums.rgb.add_weighted(group, color);
+            squares += group * color.dot(color);
         }
         sums.write(out, rays, r);
         normal.write(out, rays, 5 * rays + r);
@@ -168,11 +213,11 @@ fn backward(
     field: &[f32],
     inv_s: &[f32],
     light: &[f32],
+    sources: &[u32],
     g_out: &[f32],
     g_field: &mut [f32],
     g_ln: &mut [f32],
     anneal: f32,
-    min_weight: f32,
 ) {
     let rays = direction.len() / 3;
     let plane = t.len();
@@ -185,6 +230,9 @@ fn backward(
         let g_normal = Vec3::read(g_out, rays, 5 * rays + r);
         let g_squares = g_out[8 * rays + r];
         let (begin, end) = (offsets[r] as usize, offsets[r + 1] as usize);
+        for s in begin..end {
+            Vec3::zero().write(g_field, plane, 4 * plane + s);
+        }
         let mut farther = 0.0f32; // Σ_{j>k} w_j g_w_j
         let mut sum = 0.0f32;
         for k in 0..end - begin {
@@ -192,8 +240,13 @@ fn backward(
             let a = sample(field, plane, s, dt[s], d, inv_s, anneal);
             let transmittance = light[s];
             let w = transmittance * a.alpha;
-            let shown = select(w > min_weight, 1.0f32, 0.0f32);
-            let color = Vec3::read(field, plane, 4 * plane + s) * shown;
+            let mut color = Vec3::zero();
+            if sources[s] != COLORLESS {
+                let from = 4 * plane + sources[s] as usize;
+                color = Vec3::read(field, plane, from);
+                let by_color = (g_rgb + color * (2.0f32 * g_squares)) * w;
+                (Vec3::read(g_field, plane, from) + by_color).write(g_field, plane, from);
+            }
             // from left to right, without brackets around the dot product of the normals
             let g_w = g_rgb.dot(color)
                 + g_squares * color.dot(color)
@@ -202,7 +255,6 @@ fn backward(
                 + g_normal.x * a.normal.x
                 + g_normal.y * a.normal.y
                 + g_normal.z * a.normal.z;
-            ((g_rgb + color * (2.0f32 * g_squares)) * (w * shown)).write(g_field, plane, 4 * plane + s);
             let g_alpha = transmittance * g_w - farther / max(1.0f32 - a.alpha, 1e-10f32);
             farther += w * g_w;
             // the gradient by the unit normal has two parts: as composited, and through the cosine
@@ -248,22 +300,24 @@ fn sharpness(g_ln: &[f32], inv_s: &[f32], g_inv_s: &mut [f32]) {
 
 /// Buffers of compositing and its gradients.
 pub struct Neus {
-    /// Weight along the ray above which the color of a sample counts.
-    min_weight: f32,
+    /// Which samples have colors.
+    colors: ColorRule,
     out: Buffer,
     light: Buffer,
+    /// `[capacity]`: the samples that colors are taken from.
+    sources: Buffer,
     g_field: Buffer,
     g_ln: Buffer,
 }
 
 impl Neus {
-    /// Allocates buffers for `rays` rays and up to `capacity` samples, whose color counts where
-    /// their weight along the ray is above `min_weight`.
-    pub fn new(device: &Device, rays: usize, capacity: usize, min_weight: f32) -> Neus {
+    /// Allocates buffers for `rays` rays and up to `capacity` samples, some of which have colors.
+    pub fn new(device: &Device, rays: usize, capacity: usize, colors: ColorRule) -> Neus {
         Neus {
-            min_weight,
+            colors,
             out: device.scratch::<f32>(RAY_WIDTH * rays),
             light: device.scratch::<f32>(capacity),
+            sources: device.scratch::<u32>(capacity),
             g_field: device.scratch::<f32>(WIDTH * capacity),
             g_ln: device.scratch::<f32>(rays),
         }
@@ -310,8 +364,9 @@ impl Neus {
         anneal: f32,
     ) -> &Buffer {
         launch!(device, forward::launch, groups(self.g_ln.word_count().div_ceil(UNITS as usize)), UNITS;
-            samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.out, self.light;
-            anneal, self.min_weight
+            samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.out, self.light,
+            self.sources;
+            anneal, self.colors.min_weight, self.colors.group_weight
         );
         &self.out
     }
@@ -331,9 +386,9 @@ impl Neus {
         g_inv_s: &Buffer,
     ) -> &Buffer {
         launch!(device, backward::launch, groups(self.g_ln.word_count().div_ceil(UNITS as usize)), UNITS;
-            samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.light, g_out,
-            self.g_field, self.g_ln;
-            anneal, self.min_weight
+            samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.light,
+            self.sources, g_out, self.g_field, self.g_ln;
+            anneal
         );
         let one = CubeCount::new_single();
         launch!(device, sharpness::launch, one, UNITS; self.g_ln, inv_s, g_inv_s);
@@ -361,7 +416,7 @@ mod tests {
         g: &[[f32; RAY_WIDTH]],
     ) -> [Results; 2] {
         let (n, count) = (field.len(), segments.direction.len());
-        let device_neus = Neus::new(device, count, n, segments.min_weight);
+        let device_neus = Neus::new(device, count, n, segments.colors);
         let direction = device.upload(&planes(segments.direction, count));
         let rays = DeviceBatch { direction, ..DeviceBatch::new(device, count) };
         let samples = Samples {
@@ -386,7 +441,8 @@ mod tests {
         ));
         let flat = field.as_flattened();
         let want = neus::forward(segments, flat, inv_s, anneal);
-        let (want_field, want_s) = neus::backward(segments, flat, inv_s, anneal, g.as_flattened());
+        let sources = neus::color_sources(segments, &neus::weights(segments, flat, inv_s, anneal));
+        let (want_field, want_s) = neus::backward(segments, flat, &sources, inv_s, anneal, g.as_flattened());
         let [want, want_field] =
             [planes::<RAY_WIDTH>(want.as_chunks().0, count), planes::<WIDTH>(want_field.as_chunks().0, n)];
         [(out, g_field, device.read::<f32>(&g_s)[0]), (want, want_field, want_s)]
@@ -423,11 +479,12 @@ mod tests {
             }
         }
         let dt = vec![0.01f32; n];
-        let segments =
-            neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, min_weight: 1e-4 };
         let g: Vec<[f32; RAY_WIDTH]> =
             (0..200).map(|r| std::array::from_fn(|k| normal(5, RAY_WIDTH * r + k))).collect();
-        for (inv_s, anneal) in [(20.0, 0.0), (60.0, 0.4), (200.0, 1.0)] {
+        for (inv_s, anneal, group_weight) in [(20.0, 0.0, 0.0), (60.0, 0.4, 0.05), (200.0, 1.0, 0.3)] {
+            let colors = ColorRule { min_weight: 1e-4, group_weight };
+            let segments =
+                neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, colors };
             let [got, want] = device_and_cpu(&device, segments, &field, inv_s, anneal, &g);
             agree("rays", &got.0, &want.0, 1e-4);
             for k in 0..8 {
@@ -456,8 +513,8 @@ mod tests {
         let offsets: Vec<i32> = (0..=count as i32).map(|r| 4 * r).collect();
         let direction = vec![[0.6, 0.0, -0.8]; count];
         let (t, dt) = ([1.0, 1.1, 1.2, 1.3].repeat(count), [1e-9, 0.05, 3.0, 1e3].repeat(count));
-        let segments =
-            neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, min_weight: 1e-4 };
+        let colors = ColorRule { min_weight: 1e-4, group_weight: 0.05 };
+        let segments = neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, colors };
         let g = vec![[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]; count];
         for inv_s in [0.0, 1e-6, 1.0, 1e6, 1e9] {
             let [(out, g_field, g_s), _] = device_and_cpu(&device, segments, &field, inv_s, 1.0, &g);

@@ -15,7 +15,7 @@ use super::decoder::{self, Decoded, DecoderWeights};
 use super::gather::{self, Cell, FactorGradients, Lookup};
 use super::mask::{BoxMask, Lattice, Walk};
 use super::{DecoderShape, Grid};
-use crate::cpu::march::shift;
+use crate::cpu::march::{COLORLESS, shift};
 use crate::cpu::pool::Buffer;
 use crate::cpu::simd::{exp, ln_1p};
 use rayon::prelude::*;
@@ -112,9 +112,6 @@ impl KeptSample {
         self.alpha * self.transmittance
     }
 }
-
-/// Index of a color for samples whose weight is below the threshold, which have none.
-pub(crate) const COLORLESS: u32 = u32::MAX;
 
 /// A rendered batch of rays, with the intermediate values that its backward pass needs.
 #[derive(Clone, Debug)]

@@ -1,7 +1,8 @@
 use super::fixture::{color, decoder, density, field, grid, network};
 use super::mask::{BoxMask, Lattice, Walk};
 use super::penalty::tv_factors;
-use super::render::{COLORLESS, assign_colors};
+use super::render::assign_colors;
+use crate::cpu::march::COLORLESS;
 use super::*;
 use crate::cpu::reference;
 use tiface_base::geom::Ray;

@@ -6,7 +6,8 @@ use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
 use super::super::vec3::Vec3;
 use super::march::VmSamples;
-use crate::cpu::vm::{COLORLESS, RAY_WIDTH, VmField};
+use crate::cpu::march::COLORLESS;
+use crate::cpu::vm::{RAY_WIDTH, VmField};
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
