@@ -91,7 +91,7 @@ impl TFace {
         }
         let [density, color, _] = &self.values;
         let pass = |rays: &[Ray]| -> Vec<RayResult> {
-            let composited = vm::render(&self.field, density, color, &self.weights, &in_field(rays), &[]).out;
+            let composited = vm::composited(&self.field, density, color, &self.weights, &in_field(rays));
             composited.as_chunks().0.iter().zip(rays).map(result).collect()
         };
         rays.chunks(PASS).flat_map(pass).collect()

@@ -3,18 +3,10 @@
 //! The bits of cells lie by bricks of 4³, so that one word holds those around a point, and each
 //! brick knows how far away the nearest one is that is not empty.
 
-/// Number of cells along the edge of a brick.
+use tiface_base::geom::Ray;
+
+/// Number of cells along the edge of a brick, a power of two.
 const BRICK: usize = 4;
-
-/// Values of the three axes, and of a fourth lane that changes nothing: four lanes are one
-/// instruction.
-pub(crate) type Axes = [f32; 4];
-
-/// Returns the values of three axes with 0 in the fourth lane.
-#[inline(always)]
-pub(crate) fn axes([x, y, z]: [f32; 3]) -> Axes {
-    [x, y, z, 0.0]
-}
 
 /// Returns the indices of the set bits.
 pub(crate) fn set_bits(bits: &[u64]) -> impl Iterator<Item = usize> {
@@ -95,38 +87,46 @@ fn distances(size: [usize; 3], marked: impl Iterator<Item = bool>) -> Vec<u8> {
     distance
 }
 
-/// What a ray finds at one of its points.
-pub(crate) enum Found {
-    /// An occupied cell.
-    Occupied,
-    /// A cell in which rays end.
-    End,
-    /// An empty cell: the number of steps to the next point that may lie in one that is not.
-    Empty(i32),
+/// Number of points of a ray that are looked at together.
+pub(crate) const POINTS: usize = 8;
+
+/// Positions of points along an axis.
+type Positions = [f32; POINTS];
+
+/// What a ray finds at [`POINTS`] successive points, a bit each.
+pub(crate) struct Found {
+    /// Points in occupied cells.
+    pub occupied: u32,
+    /// Points in cells in which rays end.
+    pub ends: u32,
+    /// Number of steps from the first point to the next one that may be marked, if none of these
+    /// is.
+    pub steps: i32,
 }
 
-/// What a ray needs at each of its points.
+/// Walks along a ray through bricks.
 pub(crate) struct BrickWalk {
+    origin: [f32; 3],
+    direction: [f32; 3],
     /// Lower corner of the box.
-    low: Axes,
+    low: [f32; 3],
     /// Cells per unit of length.
-    scale: Axes,
+    scale: [f32; 3],
     /// Number of cells.
-    size: [i32; 4],
+    size: [i32; 3],
     /// Steps per cell; 0 along an axis that the ray does not move along.
-    steps: Axes,
+    steps: [f32; 3],
     /// Infinity along an axis that the ray does not move along, else 0.
-    never: Axes,
-    /// Whether the ray moves up.
-    up: [bool; 4],
+    never: [f32; 3],
 }
 
 impl BrickWalk {
-    /// Prepares a ray in `direction`, whose points are `step` apart, for the bricks of a box.
+    /// Prepares a ray whose points are `step` apart for the bricks of a box.
     #[inline(always)]
-    pub fn new(bricks: &Bricks, [low, high]: [[f32; 3]; 2], direction: Axes, step: f32) -> BrickWalk {
-        let (mut size, mut scale) = ([1; 4], [0f32; 4]);
-        let (mut steps, mut never) = ([0f32; 4], [f32::INFINITY; 4]);
+    pub fn new(bricks: &Bricks, [low, high]: [[f32; 3]; 2], ray: &Ray, step: f32) -> BrickWalk {
+        let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
+        let (mut size, mut scale) = ([0; 3], [0f32; 3]);
+        let (mut steps, mut never) = ([0f32; 3], [f32::INFINITY; 3]);
         for a in 0..3 {
             size[a] = bricks.size[a] as i32;
             scale[a] = bricks.size[a] as f32 / (high[a] - low[a]);
@@ -134,54 +134,75 @@ impl BrickWalk {
                 (steps[a], never[a]) = (1.0 / (direction[a] * scale[a] * step), 0.0);
             }
         }
-        BrickWalk { low: axes(low), scale, size, steps, never, up: direction.map(|d| d > 0.0) }
+        BrickWalk { origin, direction, low, scale, size, steps, never }
     }
 
-    /// Returns what the ray finds at `p`; outside of the box, an empty cell.
+    /// Returns what the ray finds at successive points `t`; outside of the box, empty cells.
     #[inline(always)]
-    pub fn find(&self, bricks: &Bricks, p: &Axes) -> Found {
-        let (mut g, mut cell) = ([0f32; 4], [0i32; 4]);
-        let mut outside = false;
-        for a in 0..4 {
-            g[a] = (p[a] - self.low[a]) * self.scale[a];
+    pub fn find(&self, bricks: &Bricks, t: &Positions) -> Found {
+        // each loop is of one type of number, or it would not become one of vectors
+        let mut g = [[0f32; POINTS]; 3];
+        let mut outside = [0f32; POINTS];
+        let (mut brick, mut bit) = ([0i32; POINTS], [0i32; POINTS]);
+        for a in 0..3 {
             let top = self.size[a] as f32;
-            // written so that NaN is outside, too
-            outside |= !(g[a] >= -1e-3 && g[a] <= top + 1e-3);
-            // SAFETY: the bounds keep positions far outside the box, and NaN, in the range of i32.
-            cell[a] = unsafe { g[a].max(0.0).min(top - 1.0).to_int_unchecked() };
-        }
-        if outside {
-            return Found::Empty(1);
-        }
-        let mut brick = [0i32; 4];
-        for a in 0..4 {
-            brick[a] = cell[a] / BRICK as i32;
-        }
-        let [x, y, z, _] = brick.map(|b| b as usize);
-        let at = (x * bricks.bricks[1] + y) * bricks.bricks[2] + z;
-        let distance = i32::from(bricks.distance[at]);
-        if distance == 0 {
-            let [x, y, z, _] = cell.map(|c| c as usize % BRICK);
-            let bit = (x * BRICK + y) * BRICK + z;
-            if bricks.occupied[at] >> bit & 1 == 1 {
-                return Found::Occupied;
+            let mut cell = [0i32; POINTS];
+            for i in 0..POINTS {
+                g[a][i] = (self.origin[a] + t[i] * self.direction[a] - self.low[a]) * self.scale[a];
             }
-            if bricks.ends.get(at).is_some_and(|word| word >> bit & 1 == 1) {
-                return Found::End;
+            for i in 0..POINTS {
+                outside[i] = outside[i].max(-g[a][i]).max(g[a][i] - top);
+            }
+            for i in 0..POINTS {
+                // SAFETY: the bounds keep positions far outside the box, and NaN, in the range of
+                // i32.
+                cell[i] = unsafe { g[a][i].max(0.0).min(top - 1.0).to_int_unchecked() };
+            }
+            for i in 0..POINTS {
+                brick[i] = brick[i] * bricks.bricks[a] as i32 + (cell[i] >> BRICK.ilog2());
+                bit[i] = bit[i] * BRICK as i32 + (cell[i] & (BRICK as i32 - 1));
             }
         }
-        // to the border of the empty cell, or of the empty bricks around it
-        let mut border = [0f32; 4];
-        for a in 0..4 {
-            let above = if distance == 0 { cell[a] + 1 } else { (brick[a] + distance) * BRICK as i32 };
-            let below = if distance == 0 { cell[a] } else { (brick[a] + 1 - distance) * BRICK as i32 };
-            let wall = if self.up[a] { above.min(self.size[a]) } else { below.max(0) };
-            border[a] = (wall as f32 - g[a]) * self.steps[a] + self.never[a];
+        let mut inside = [0u32; POINTS];
+        for i in 0..POINTS {
+            inside[i] = u32::from(outside[i] <= 1e-3);
+        }
+        let (mut occupied, mut ends) = (0, 0);
+        for i in 0..POINTS {
+            let word = bricks.occupied[brick[i] as usize] >> bit[i];
+            occupied |= (word as u32 & inside[i]) << i;
+        }
+        if !bricks.ends.is_empty() {
+            for i in 0..POINTS {
+                let word = bricks.ends[brick[i] as usize] >> bit[i];
+                ends |= (word as u32 & inside[i]) << i;
+            }
+        }
+        let mut steps = POINTS as i32;
+        if occupied | ends == 0 {
+            let distance = i32::from(bricks.distance[brick[POINTS - 1] as usize]);
+            if distance > 0 && inside[POINTS - 1] == 1 {
+                steps = POINTS as i32 - 1 + self.to_border([0, 1, 2].map(|a| g[a][POINTS - 1]), distance);
+            }
+        }
+        Found { occupied, ends, steps }
+    }
+
+    /// Returns the number of steps from the position `g`, in cells, to the first point beyond the
+    /// bricks around it that are nearer than `distance`.
+    #[inline(always)]
+    fn to_border(&self, g: [f32; 3], distance: i32) -> i32 {
+        let mut border = f32::INFINITY;
+        for a in 0..3 {
+            let brick = (g[a].max(0.0) as i32).min(self.size[a] - 1) / BRICK as i32;
+            let above = ((brick + distance) * BRICK as i32).min(self.size[a]);
+            let below = ((brick + 1 - distance) * BRICK as i32).max(0);
+            let wall = if self.direction[a] > 0.0 { above } else { below };
+            border = border.min((wall as f32 - g[a]) * self.steps[a] + self.never[a]);
         }
         // slightly less than that, so that rounding cannot skip a point in the next cell
-        let steps = border[0].min(border[1]).min(border[2]) - 1e-3;
-        // SAFETY: the bounds keep the number, and NaN, in the range of i32.
-        Found::Empty(unsafe { steps.ceil().max(1.0).min(1e9).to_int_unchecked() })
+        let whole = (border - 1e-3).ceil().max(1.0).min(1e9);
+        whole as i32
     }
 }
 

@@ -3,7 +3,7 @@
 //! All samples of a ray lie on one lattice of pitch `step` (as in nerfacc 0.3.3): empty cells are
 //! skipped by whole steps, so that positions do not depend on which cells happen to be empty.
 
-use super::bricks::{BrickWalk, Bricks, Found, axes};
+use super::bricks::{BrickWalk, Bricks, POINTS};
 use rayon::prelude::*;
 use tiface_base::dispatch;
 use tiface_base::geom::{BitGrid, Ray};
@@ -126,7 +126,7 @@ fn march_one(
     jitter: f32,
     limit: usize,
 ) {
-    let (origin, direction) = (axes(ray.origin.to_array()), axes(ray.direction.to_array()));
+    let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
     let (mut enter, mut leave) = (0f32, f32::INFINITY);
     for a in 0..3 {
         let (o, d) = (origin[a], direction[a]);
@@ -143,30 +143,31 @@ fn march_one(
     if enter.is_nan() || leave.is_nan() || enter >= leave || !step.is_finite() || step <= 0.0 {
         return;
     }
-    let walk = BrickWalk::new(bricks, [[-radius; 3], [radius; 3]], direction, step);
+    let walk = BrickWalk::new(bricks, [[-radius; 3], [radius; 3]], ray, step);
     let start = enter + jitter * step;
     let end = samples.len().saturating_add(limit);
     // t = start + (k + ½) · step for integer k: computed, never accumulated
     let mut k = 0i32;
-    while samples.len() < end {
-        let t = start + (k as f32 + 0.5) * step;
-        // also ends what never leaves
-        if t >= leave || k == i32::MAX {
+    let mut t = [0f32; POINTS];
+    loop {
+        for i in 0..POINTS {
+            t[i] = start + ((k + i as i32) as f32 + 0.5) * step;
+        }
+        let found = walk.find(bricks, &t);
+        // samples before the first point at which the ray ends
+        let mut left = found.occupied & !found.ends & found.ends.wrapping_sub(1);
+        while left != 0 {
+            let t = t[left.trailing_zeros() as usize];
+            if t >= leave || samples.len() >= end {
+                return;
+            }
+            samples.push(t);
+            left &= left - 1;
+        }
+        k = k.saturating_add(if found.occupied == 0 { found.steps } else { POINTS as i32 });
+        if found.ends != 0 || t[POINTS - 1] >= leave || k > i32::MAX - POINTS as i32 {
             return;
         }
-        let mut p = [0f32; 4];
-        for a in 0..4 {
-            p[a] = origin[a] + t * direction[a];
-        }
-        let steps = match walk.find(bricks, &p) {
-            Found::Occupied => {
-                samples.push(t);
-                1
-            }
-            Found::Empty(steps) => steps,
-            Found::End => return,
-        };
-        k = k.saturating_add(steps);
     }
 }
 

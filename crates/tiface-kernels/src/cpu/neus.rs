@@ -510,7 +510,7 @@ mod tests {
         // (weight of a group, weights, sources of a ray whose first sample is 10)
         let cases: [(f32, &[f32], &[u32]); 6] = [
             (0.0, &[0.3, 0.0, 0.2], &[10, NONE, 12]),
-            (0.05, &[0.02, 1e-5, 0.03, 0.3, 0.04, 0.02], &[12, NONE, 12, 13, 14, 14]),
+            (0.05, &[0.02, 1e-5, 0.04, 0.3, 0.04, 0.02], &[12, NONE, 12, 13, 14, 14]),
             // what is left takes the color before it, even where it is heavier
             (0.05, &[0.06, 0.01, 0.02], &[10, 10, 10]),
             (0.5, &[0.1, 0.3, 0.2, 0.4], &[11, 11, 11, 11]),

@@ -26,7 +26,7 @@ pub use gather::Cell;
 pub use penalty::penalize;
 #[cfg(feature = "wgpu")]
 pub(crate) use penalty::tv_factors;
-pub use render::{RAY_WIDTH, Rendered, Shading, VmField, backward, density_at, render};
+pub use render::{RAY_WIDTH, Rendered, Shading, VmField, backward, composited, density_at, render};
 pub use resize::{cropped, resized};
 
 /// Axes (width, height) of each term's plane; x, y, z are 0, 1, 2.

@@ -221,7 +221,7 @@ mod renderer_tests {
         let Some(device) = device() else { return };
         let case = case(NARROW, 500);
         let weights = DecoderWeights::new(case.field.decoder, &case.network);
-        let want = render(&case.field, &case.density, &case.color, &weights, &case.rays, &[]).out;
+        let want = composited(&case.field, &case.density, &case.color, &weights, &case.rays);
         let values = [case.density.as_slice(), &case.color, &case.network];
         let mut renderer = VmRenderer::new(Arc::new(device), &case.field, values);
         agree("rendered", renderer.render(&case.rays).unwrap().as_flattened(), &want, 1e-4);

@@ -6,7 +6,7 @@
 //! rgb = sigmoid(W3 relu(W2 relu(W1 in + b1) + b2) + b3)
 //! ```
 
-use super::gather::FactorGradients;
+use super::gather::{FactorGradients, PlaneGradients};
 use super::{Cell, Grid};
 use crate::cpu::matrix::{Matrix, add_to, split};
 use crate::cpu::pool::{Buffer, pieces};
@@ -374,8 +374,8 @@ pub(super) fn decode_backward(
         add_to(&mut flat, &s.shapes(), &parts);
     }
     drop(tasks);
-    let gradients =
-        FactorGradients { cells: &decoded.cells, planes: &decoded.planes, lines: &decoded.lines, stride: cp };
+    let planes = PlaneGradients::Given(&decoded.planes);
+    let gradients = FactorGradients { cells: &decoded.cells, planes, lines: &decoded.lines, stride: cp };
     super::gather::scatter(grid, &gradients, g_values);
     flat
 }

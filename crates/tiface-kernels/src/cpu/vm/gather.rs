@@ -22,9 +22,12 @@ impl Cell {
     pub fn new(size: [usize; 3], unit: [f32; 3]) -> Cell {
         let mut cell = Cell::default();
         for a in 0..3 {
-            let x = (unit[a] * (size[a] - 1) as f32).clamp(0.0, (size[a] - 1) as f32);
-            let i = (x as u32).min(size[a] as u32 - 2);
-            cell.index[a] = i;
+            let top = (size[a] - 1) as f32;
+            // unlike `clamp`, `max` and `min` also bound NaN
+            let x = (unit[a] * top).max(0.0).min(top);
+            // SAFETY: the bounds keep the number in the range of i32.
+            let i = unsafe { x.to_int_unchecked::<i32>() }.min(size[a] as i32 - 2);
+            cell.index[a] = i as u32;
             cell.frac[a] = x - i as f32;
         }
         cell
@@ -78,12 +81,20 @@ fn look_up<const F: bool, const W: usize>(
     let (l, m) = (lanes::<W>(term.line, line + c), lanes::<W>(term.line, line + n + c));
     let w = at.weight;
     let mut plane = [0f32; W];
-    let mut value = [0f32; W];
     for k in 0..W {
         plane[k] = fma::<F>(w[3], e[k], fma::<F>(w[2], d[k], fma::<F>(w[1], b[k], w[0] * a[k])));
-        value[k] = fma::<F>(z, m[k] - l[k], l[k]);
     }
-    (plane, value)
+    (plane, mixed::<F, W>(l, m, z))
+}
+
+/// `a + t (b − a)` for each channel.
+#[inline(always)]
+fn mixed<const F: bool, const W: usize>(a: &[f32; W], b: &[f32; W], t: f32) -> [f32; W] {
+    let mut out = [0f32; W];
+    for k in 0..W {
+        out[k] = fma::<F>(t, b[k] - a[k], a[k]);
+    }
+    out
 }
 
 /// Runs `body` over the channels of a term, in pieces of the largest width that fits.
@@ -122,21 +133,27 @@ impl<'a> Lookup<'a> {
         self.size
     }
 
-    /// Returns the sum over terms and channels of plane times line.
+    /// Returns the sum over terms and channels of plane times line. If `KEEP`, writes the plane
+    /// values of all channels, term by term, to `planes`, `[channels]`.
     #[inline(always)]
-    pub fn sum<const F: bool>(&self, cell: &Cell) -> f32 {
+    pub fn sum<const F: bool, const KEEP: bool>(&self, cell: &Cell, planes: &mut [f32]) -> f32 {
         // a number of channels that is known leaves nothing to ask at each sample
         match self.terms.each_ref().map(|term| term.channels) {
-            [8, 8, 8] => self.sum_of::<F, 8>(cell),
-            _ => self.sum_of::<F, 0>(cell),
+            [8, 8, 8] => self.sum_of::<F, KEEP, 8>(cell, planes),
+            _ => self.sum_of::<F, KEEP, 0>(cell, planes),
         }
     }
 
     /// As [`Lookup::sum`], of `N` channels a term, or of any number if it is 0.
     #[inline(always)]
-    fn sum_of<const F: bool, const N: usize>(&self, cell: &Cell) -> f32 {
+    fn sum_of<const F: bool, const KEEP: bool, const N: usize>(
+        &self,
+        cell: &Cell,
+        planes: &mut [f32],
+    ) -> f32 {
         // of whole lanes and of what is left of the channels, apart so that lanes stay whole
         let (mut sums, mut rest) = ([0f32; 8], 0f32);
+        let mut first = 0;
         for i in 0..3 {
             let term = &self.terms[i];
             let channels = if N > 0 { N } else { term.channels };
@@ -144,7 +161,12 @@ impl<'a> Lookup<'a> {
             let axis = LINE_AXIS[i];
             let line = cell.index[axis] as usize * channels;
             in_pieces!(channels, c, W, {
-                let (p, v) = look_up::<F, W>(term, &at, line, cell.frac[axis], c);
+                let (mut p, v) = look_up::<F, W>(term, &at, line, cell.frac[axis], c);
+                if KEEP {
+                    // as of the sums below
+                    p = std::hint::black_box(p);
+                    planes[first + c..first + c + W].copy_from_slice(&p);
+                }
                 for k in 0..W {
                     if W >= 8 {
                         sums[k % 8] = fma::<F>(p[k], v[k], sums[k % 8]);
@@ -153,6 +175,7 @@ impl<'a> Lookup<'a> {
                     }
                 }
             });
+            first += channels;
         }
         // By halves, since eight additions in a row would wait for each other. Without the black
         // box the compiler splits the products above into scalars.
@@ -163,6 +186,26 @@ impl<'a> Lookup<'a> {
             }
         }
         sums[0] + rest
+    }
+
+    /// Returns the line values of `N` channels of a term, which has no others.
+    #[inline(always)]
+    fn line_values<const F: bool, const N: usize>(&self, term: usize, cell: &Cell) -> [f32; N] {
+        let (values, axis) = (self.terms[term].line, LINE_AXIS[term]);
+        let at = cell.index[axis] as usize * N;
+        mixed::<F, N>(lanes(values, at), lanes(values, at + N), cell.frac[axis])
+    }
+
+    /// Writes the line values of all channels of a term.
+    #[inline(always)]
+    fn write_line_values<const F: bool>(&self, term: usize, cell: &Cell, out: &mut [f32]) {
+        let (values, axis, n) = (self.terms[term].line, LINE_AXIS[term], self.terms[term].channels);
+        let at = cell.index[axis] as usize * n;
+        in_pieces!(n, c, W, {
+            let value: [f32; W] =
+                mixed::<F, W>(lanes(values, at + c), lanes(values, at + n + c), cell.frac[axis]);
+            out[c..c + W].copy_from_slice(&value);
+        });
     }
 
     /// Writes plane and line values of all channels, term by term. Both slices are `[channels]` or
@@ -188,12 +231,20 @@ impl<'a> Lookup<'a> {
 /// Gradients of a loss with respect to the interpolated plane and line values of samples.
 pub(super) struct FactorGradients<'a> {
     pub cells: &'a [Cell],
+    pub planes: PlaneGradients<'a>,
     /// `[samples, stride]`, the first `channels` of a row are used.
-    pub planes: &'a [f32],
-    /// Shaped like `planes`.
     pub lines: &'a [f32],
     /// Number of floats per row.
     pub stride: usize,
+}
+
+/// Gradients with respect to the interpolated plane values of samples.
+pub(super) enum PlaneGradients<'a> {
+    /// Shaped like the gradients of lines.
+    Given(&'a [f32]),
+    /// Those of the sum of plane times line: the gradients `[samples]` with respect to the sum,
+    /// times the line values, which are few enough to be looked up again faster than read.
+    OfSum(&'a [f32], &'a Lookup<'a>),
 }
 
 /// The part of a plane or line that one task owns in the scatter.
@@ -261,12 +312,30 @@ fn band_of<const F: bool, const N: usize>(band: &mut ScatterBand, gradients: &Fa
     let (a, b) = PLANE_AXES[band.term];
     let pitch = band.width * n;
     let rows = band.values.len() / pitch;
+    let mut of_any_number = vec![0f32; if N > 0 { 0 } else { n }];
     for &s in &band.samples {
         let s = s as usize;
         let cell = &gradients.cells[s];
         // a sample contributes to this row and the next, either of which may belong to another band
         let row = (cell.index[b] as usize).wrapping_sub(band.row);
-        let g = &gradients.planes[s * gradients.stride + band.first..][..n];
+        let mut of_known_number;
+        let g = match gradients.planes {
+            PlaneGradients::Given(planes) => &planes[s * gradients.stride + band.first..][..n],
+            PlaneGradients::OfSum(by_sum, lookup) if N > 0 => {
+                of_known_number = lookup.line_values::<F, N>(band.term, cell);
+                for g in &mut of_known_number {
+                    *g *= by_sum[s];
+                }
+                &of_known_number[..]
+            }
+            PlaneGradients::OfSum(by_sum, lookup) => {
+                lookup.write_line_values::<F>(band.term, cell, &mut of_any_number);
+                for g in &mut of_any_number {
+                    *g *= by_sum[s];
+                }
+                &of_any_number
+            }
+        };
         let (x, y) = (cell.frac[a], cell.frac[b]);
         let at = cell.index[a] as usize * n;
         if row < rows {

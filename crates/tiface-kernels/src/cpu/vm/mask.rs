@@ -8,7 +8,7 @@
 
 #[cfg(feature = "wgpu")]
 use crate::cpu::bricks::set_bits;
-use crate::cpu::bricks::{Axes, BrickWalk, Bricks, Found, axes};
+use crate::cpu::bricks::{BrickWalk, Bricks, POINTS};
 use tiface_base::geom::Ray;
 
 /// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`.
@@ -193,16 +193,20 @@ pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3
 /// instructions of the kernel that calls it.
 pub struct Walk<'a> {
     mask: Option<(&'a Bricks, BrickWalk)>,
-    origin: Axes,
-    direction: Axes,
+    origin: [f32; 3],
+    direction: [f32; 3],
     /// The field's box, with slack for rounding.
-    low: Axes,
-    high: Axes,
+    low: [f32; 3],
+    high: [f32; 3],
     start: f32,
     step: f32,
     leave: f32,
-    /// Index of the next lattice point.
+    /// Index of the first of the lattice points that were looked at last.
     k: i32,
+    /// Those of them that are still to be returned, a bit each.
+    left: u32,
+    /// Index of the first of the points that are looked at next.
+    next: i32,
     end: i32,
 }
 
@@ -211,57 +215,86 @@ impl<'a> Walk<'a> {
     /// part of a step; it has no points if the ray misses the box.
     #[inline(always)]
     pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &Ray, jitter: f32) -> Walk<'a> {
-        let (origin, direction) = (axes(ray.origin.to_array()), axes(ray.direction.to_array()));
+        let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
         let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
         let (enter, leave) = crossing.unwrap_or((0.0, 0.0));
         let start = enter.clamp(lattice.near, lattice.far) + jitter * lattice.step;
-        let (mut low, mut high) = (axes(lattice.min), axes(lattice.max));
+        let (mut low, mut high) = (lattice.min, lattice.max);
         for a in 0..3 {
-            let slack = 1e-6 * (lattice.max[a] - lattice.min[a]);
+            let slack = 1e-6 * (high[a] - low[a]);
             low[a] -= slack;
             high[a] += slack;
         }
         let of_ray =
-            |m: &'a BoxMask| (&m.bricks, BrickWalk::new(&m.bricks, [m.min, m.max], direction, lattice.step));
-        let mask = mask.map(of_ray);
+            |m: &'a BoxMask| (&m.bricks, BrickWalk::new(&m.bricks, [m.min, m.max], ray, lattice.step));
         let any = crossing.is_some() && start.is_finite();
         let last = lattice.samples.saturating_sub(1).try_into().unwrap_or(i32::MAX);
-        // the border itself belongs to the box, and rounding may put a sample just outside
-        let leave = leave + lattice.step;
-        let end = if any { last } else { 0 };
-        Walk { mask, origin, direction, low, high, start, step: lattice.step, leave, k: 0, end }
+        Walk {
+            mask: mask.map(of_ray),
+            origin,
+            direction,
+            low,
+            high,
+            start,
+            step: lattice.step,
+            // the border itself belongs to the box, and rounding may put a sample just outside
+            leave: leave + lattice.step,
+            k: 0,
+            left: 0,
+            next: 0,
+            end: if any { last } else { 0 },
+        }
+    }
+
+    /// Returns `t` of a lattice point.
+    #[inline(always)]
+    fn t(&self, k: i32) -> f32 {
+        self.start + self.step * k as f32
     }
 
     /// Returns `t` of the next lattice point.
     #[inline(always)]
     pub fn advance(&mut self) -> Option<f32> {
-        while self.k < self.end {
-            let t = self.start + self.step * self.k as f32;
-            if t > self.leave {
+        while self.left == 0 {
+            self.k = self.next;
+            if self.k >= self.end || self.t(self.k) > self.leave {
                 return None;
             }
-            let mut p = [0f32; 4];
-            let mut outside = false;
-            for a in 0..4 {
-                p[a] = self.origin[a] + t * self.direction[a];
-                // written so that NaN is outside, too
-                outside |= !(p[a] >= self.low[a] && p[a] <= self.high[a]);
-            }
-            if outside {
-                self.k += 1;
-                continue;
-            }
-            let found = match &self.mask {
-                Some((bricks, walk)) => walk.find(bricks, &p),
-                None => Found::Occupied,
-            };
-            let Found::Empty(steps) = found else {
-                self.k += 1;
-                return Some(t);
-            };
-            // a sum beyond the range of numbers is beyond the end, too
-            self.k = self.k.saturating_add(steps);
+            self.look();
         }
-        None
+        let i = self.left.trailing_zeros() as i32;
+        self.left &= self.left - 1;
+        Some(self.t(self.k.wrapping_add(i)))
+    }
+
+    /// Looks at the next lattice points.
+    #[inline(always)]
+    fn look(&mut self) {
+        let mut t = [0f32; POINTS];
+        for i in 0..POINTS {
+            t[i] = self.start + self.step * self.k.wrapping_add(i as i32) as f32;
+        }
+        // how far outside of the box
+        let mut outside = [f32::NEG_INFINITY; POINTS];
+        for a in 0..3 {
+            for i in 0..POINTS {
+                let p = self.origin[a] + t[i] * self.direction[a];
+                outside[i] = outside[i].max(self.low[a] - p).max(p - self.high[a]);
+            }
+        }
+        for i in 0..POINTS {
+            self.left |= u32::from(outside[i] <= 0.0 && t[i] <= self.leave) << i;
+        }
+        // the last points of the lattice
+        let exist = (self.end - self.k).min(POINTS as i32);
+        self.left &= (1 << exist) - 1;
+        self.next = self.k.saturating_add(POINTS as i32);
+        if let Some((bricks, walk)) = &self.mask {
+            let found = walk.find(bricks, &t);
+            self.left &= found.occupied;
+            if found.occupied == 0 {
+                self.next = self.k.saturating_add(found.steps);
+            }
+        }
     }
 }

@@ -12,7 +12,7 @@
 //! used up.
 
 use super::decoder::{self, Decoded, DecoderWeights};
-use super::gather::{self, Cell, FactorGradients, Lookup};
+use super::gather::{self, Cell, FactorGradients, Lookup, PlaneGradients};
 use super::mask::{BoxMask, Lattice, Walk};
 use super::{DecoderShape, Grid};
 use crate::cpu::march::{COLORLESS, shift};
@@ -133,6 +133,10 @@ pub struct Rendered {
 struct Marched {
     kept: Vec<KeptSample>,
     cells: Vec<Cell>,
+    /// Whether a backward pass follows.
+    keeps_planes: bool,
+    /// `[kept, channels]`: interpolated values of the density's planes, if a backward pass follows.
+    planes: Vec<f32>,
     /// `[rays + 1]` into `kept`.
     offsets: Vec<u32>,
     /// `[kept]`: index into the colors of the task, or [`COLORLESS`].
@@ -149,16 +153,9 @@ impl Marched {
         self.offsets.windows(2).map(|ends| ends[0] as usize..ends[1] as usize)
     }
 
-    /// Returns the gradients by the features of samples, and drops the cells of those whose
-    /// gradient is exactly zero, which need no scatter: both lists then have the others alone. Adds
-    /// the gradients by the task's colors `rgb` to `g_rgb`; `g` is `[rays, 5]`.
-    fn gradients(
-        &mut self,
-        field: &VmField,
-        g: &[f32],
-        rgb: &[[f32; 3]],
-        g_rgb: &mut [[f32; 3]],
-    ) -> Vec<f32> {
+    /// Returns the gradients by the features of samples, and adds those by the task's colors `rgb`
+    /// to `g_rgb`; `g` is `[rays, 5]`.
+    fn gradients(&self, field: &VmField, g: &[f32], rgb: &[[f32; 3]], g_rgb: &mut [[f32; 3]]) -> Vec<f32> {
         let length = field.lattice.step * field.shading.distance_scale;
         let mut g_feature = vec![0f32; self.kept.len()];
         for (g, samples) in g.chunks_exact(RAY_WIDTH).zip(self.rays()) {
@@ -180,9 +177,6 @@ impl Marched {
                 farther += w * g_w;
             }
         }
-        let mut of_cells = g_feature.iter();
-        self.cells.retain(|_| of_cells.next().is_some_and(|g| *g != 0.0));
-        g_feature.retain(|g| *g != 0.0);
         g_feature
     }
 }
@@ -215,13 +209,17 @@ fn march_body<const F: bool>(
 ) {
     let s = &field.shading;
     let length = field.lattice.step * s.distance_scale;
+    let mut planes = vec![0f32; field.density.channels()];
     for (r, ray) in rays.iter().enumerate() {
         let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
         let mut transmittance = 1f32;
         let mut walk = Walk::new(&field.lattice, field.mask.as_ref(), ray, shift(jitter, r));
         while let Some(t) = walk.advance() {
             let cell = field.cell(std::array::from_fn(|a| origin[a] + t * direction[a]));
-            let feature = lookup.sum::<F>(&cell);
+            let feature = match task.keeps_planes {
+                true => lookup.sum::<F, true>(&cell, &mut planes),
+                false => lookup.sum::<F, false>(&cell, &mut planes),
+            };
             task.looked_up += 1;
             if !s.softplus && feature <= 0.0 {
                 transmittance *= 1.0 + 1e-10;
@@ -230,6 +228,9 @@ fn march_body<const F: bool>(
             let alpha = 1.0 - exp::<F>(-s.density::<F>(feature) * length);
             task.kept.push(KeptSample { t, feature, alpha, transmittance });
             task.cells.push(cell);
+            if task.keeps_planes {
+                task.planes.extend_from_slice(&planes);
+            }
             transmittance *= 1.0 - alpha + 1e-10;
             if transmittance <= s.stop {
                 break;
@@ -297,6 +298,28 @@ pub fn render(
     rays: &[Ray],
     jitter: &[f32],
 ) -> Rendered {
+    rendered(field, [density, color], decoder, rays, jitter, true)
+}
+
+/// As [`Rendered::out`] of [`render`], without what a backward pass needs.
+pub fn composited(
+    field: &VmField,
+    density: &[f32],
+    color: &[f32],
+    decoder: &DecoderWeights,
+    rays: &[Ray],
+) -> Vec<f32> {
+    rendered(field, [density, color], decoder, rays, &[], false).out
+}
+
+fn rendered(
+    field: &VmField,
+    [density, color]: [&[f32]; 2],
+    decoder: &DecoderWeights,
+    rays: &[Ray],
+    jitter: &[f32],
+    keeps_planes: bool,
+) -> Rendered {
     assert!(jitter.is_empty() || jitter.len() == rays.len());
     let lookup = Lookup::new(&field.density, density);
     assert_eq!(lookup.size(), field.color.size);
@@ -305,6 +328,8 @@ pub fn render(
         let mut marched = Marched {
             kept: Vec::with_capacity(rays.len() * 32),
             cells: Vec::with_capacity(rays.len() * 32),
+            keeps_planes,
+            planes: Vec::new(),
             offsets: vec![0],
             color_of: Vec::new(),
             colored: Vec::new(),
@@ -347,29 +372,28 @@ pub fn render(
     Rendered { out, density_samples, color_samples: colors as u64, marched, decoded }
 }
 
+/// Gradients of a task's samples, without those that are exactly zero: cells, gradients with respect
+/// to the sum of plane times line, and those with respect to line values.
+struct Gradients<'a> {
+    cells: &'a mut [Cell],
+    by_sum: &'a mut [f32],
+    lines: &'a mut [f32],
+}
+
 #[inline(always)]
-fn factors_body<const F: bool>(
-    cells: &[Cell],
-    gradient: &[f32],
-    planes: &mut [f32],
-    lines: &mut [f32],
-    n: usize,
-    lookup: &Lookup,
-) {
-    for (i, (cell, &g)) in cells.iter().zip(gradient).enumerate() {
-        let (p, l) = (&mut planes[i * n..][..n], &mut lines[i * n..][..n]);
-        lookup.factors::<F>(cell, p, l);
-        for (p, l) in p.iter_mut().zip(l) {
-            (*p, *l) = (g * *l, g * *p);
+fn gradients_body<const F: bool>(m: &Marched, g: &[f32], out: &mut Gradients) {
+    let n = out.lines.len() / out.by_sum.len().max(1);
+    let mut k = 0;
+    for (i, &g) in g.iter().enumerate().filter(|(_, g)| **g != 0.0) {
+        (out.cells[k], out.by_sum[k]) = (m.cells[i], g);
+        for (line, plane) in out.lines[k * n..][..n].iter_mut().zip(&m.planes[i * n..][..n]) {
+            *line = g * plane;
         }
+        k += 1;
     }
 }
 
-dispatch! {
-    fn factor_gradients / factors_body(
-        cells: &[Cell], gradient: &[f32], planes: &mut [f32], lines: &mut [f32], n: usize, lookup: &Lookup,
-    )
-}
+dispatch! { fn line_gradients / gradients_body(m: &Marched, g: &[f32], out: &mut Gradients) }
 
 /// Computes the gradients of a rendered batch: adds those with respect to the grids to `g_density`
 /// and `g_color`, and returns those with respect to the decoder's flat weights. `g` is the gradient
@@ -384,37 +408,35 @@ pub fn backward(
     g_color: &mut [f32],
 ) -> Vec<f32> {
     assert_eq!(g.len(), rendered.out.len(), "a gradient for each ray");
-    let Rendered { mut marched, decoded, .. } = rendered;
+    let Rendered { marched, decoded, .. } = rendered;
     let mut g_rgb = vec![[0f32; 3]; decoded.rgb.len()];
     let (rgb_of, g_rgb_of) = (by_task(&marched, &decoded.rgb), by_task_mut(&marched, &mut g_rgb));
     let of_rays = g.par_chunks(RAYS * RAY_WIDTH);
-    let g_feature: Vec<Vec<f32>> = (&mut marched, of_rays, rgb_of, g_rgb_of)
+    let g_feature: Vec<Vec<f32>> = (&marched, of_rays, rgb_of, g_rgb_of)
         .into_par_iter()
         .map(|(m, g, rgb, g_rgb)| m.gradients(field, g, rgb, g_rgb))
         .collect();
 
     let lookup = Lookup::new(&field.density, density);
     let n = field.density.channels();
-    let count = g_feature.iter().map(Vec::len).sum::<usize>();
+    let counts: Vec<usize> = g_feature.iter().map(|g| g.iter().filter(|g| **g != 0.0).count()).collect();
+    let count = counts.iter().sum::<usize>();
     let mut cells = Buffer::scratch(count * CELL_FLOATS);
-    let [mut planes, mut lines] = [(); 2].map(|()| Buffer::scratch(count * n));
-    let mut rest = [&mut cells[..], &mut planes[..], &mut lines[..]];
-    let tasks: Vec<_> = g_feature
-        .iter()
-        .zip(&marched)
-        .map(|(g, m)| {
+    let (mut by_sum, mut lines) = (Buffer::scratch(count), Buffer::scratch(count * n));
+    let mut rest = [&mut cells[..], &mut by_sum[..], &mut lines[..]];
+    let tasks: Vec<_> = (g_feature.iter().zip(&marched).zip(counts))
+        .map(|((g, m), count)| {
             let mut cut = |k: usize, width: usize| {
-                rest[k].split_off_mut(..g.len() * width).expect("a row for each sample")
+                rest[k].split_off_mut(..count * width).expect("a row for each sample")
             };
-            (m, g, cut(0, CELL_FLOATS), cut(1, n), cut(2, n))
+            let cells = bytemuck::cast_slice_mut(cut(0, CELL_FLOATS));
+            (m, g, Gradients { cells, by_sum: cut(1, 1), lines: cut(2, n) })
         })
         .collect();
-    tasks.into_par_iter().for_each(|(m, g, cells, planes, lines)| {
-        bytemuck::cast_slice_mut(cells).copy_from_slice(&m.cells);
-        factor_gradients(&m.cells, g, planes, lines, n, &lookup);
-    });
-    let cells: &[Cell] = bytemuck::cast_slice(&cells);
-    let gradients = FactorGradients { cells, planes: &planes, lines: &lines, stride: n };
+    tasks.into_par_iter().for_each(|(m, g, mut out)| line_gradients(m, g, &mut out));
+    drop(marched);
+    let planes = PlaneGradients::OfSum(&by_sum, &lookup);
+    let gradients = FactorGradients { cells: bytemuck::cast_slice(&cells), planes, lines: &lines, stride: n };
     gather::scatter(&field.density, &gradients, g_density);
     decoder::decode_backward(&field.color, decoder, decoded, &g_rgb, g_color)
 }
@@ -422,7 +444,7 @@ pub fn backward(
 #[inline(always)]
 fn density_body<const F: bool>(points: &[[f32; 3]], out: &mut [f32], field: &VmField, lookup: &Lookup) {
     for (p, out) in points.iter().zip(out) {
-        *out = field.shading.density::<F>(lookup.sum::<F>(&field.cell(*p)));
+        *out = field.shading.density::<F>(lookup.sum::<F, false>(&field.cell(*p), &mut []));
     }
 }
 
