@@ -1,6 +1,8 @@
 //! Updates of the occupancy grid, by a band around the zero level set or by nerfacc's rule. The
 //! update functions take the field as a function of points.
 
+use super::bricks::set_bits;
+use super::pool::Buffer;
 use rayon::prelude::*;
 use tiface_base::geom::BitGrid;
 use tiface_base::math::rng;
@@ -41,15 +43,23 @@ pub fn update_band(
     inv_s: f32,
     field: impl Fn(&[[f32; 3]]) -> Vec<[f32; 2]>,
 ) {
+    /// Cells that are filled together.
+    const FILLED: usize = 1 << 16;
+    enum Kind {
+        Occupied,
+        Solid,
+        Empty,
+    }
     let r = allowed.resolution;
     let cell = 2.0 * radius / r as f32;
     let half_diagonal = 0.5 * 3f32.sqrt() * cell;
-    let cells: Vec<usize> = (0..r * r * r).filter(|&i| allowed.get(i)).collect();
+    let cells: Vec<usize> = set_bits(&allowed.bits).collect();
     let center = |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - radius);
     // cells that are not evaluated are NaN, which has no sign and never differs in sign from a
     // neighbor
-    let mut f = vec![f32::NAN; r * r * r];
-    let mut band = vec![rule.width / inv_s + half_diagonal; r * r * r];
+    let [mut f, mut band] = [(); 2].map(|()| Buffer::scratch(r * r * r));
+    f.par_chunks_mut(FILLED).for_each(|f| f.fill(f32::NAN));
+    band.par_chunks_mut(FILLED).for_each(|band| band.fill(rule.width / inv_s + half_diagonal));
     for cells in cells.chunks(1 << 17) {
         let points: Vec<[f32; 3]> = cells.par_iter().map(|&i| center(i)).collect();
         for (&i, [distance, soft]) in cells.iter().zip(field(&points)) {
@@ -70,18 +80,26 @@ pub fn update_band(
             widest.max(before).max(after)
         })
     };
-    occupied.bits.fill(0);
-    solid.bits.fill(0);
-    for &i in &cells {
+    let kind_of = |&i: &usize| {
         let crossed = [1, r, r * r].into_iter().any(|stride| {
             let position = i / stride % r;
             let is_opposite = |j: usize| f[j] * f[i] < 0.0;
             (position > 0 && is_opposite(i - stride)) || (position + 1 < r && is_opposite(i + stride))
         });
-        if f[i].abs() < widest_near(i) || crossed {
-            occupied.set(i, true);
-        } else if f[i] < 0.0 {
-            solid.set(i, true);
+        match f[i].abs() < widest_near(i) || crossed {
+            true => Kind::Occupied,
+            false if f[i] < 0.0 => Kind::Solid,
+            false => Kind::Empty,
+        }
+    };
+    let kinds: Vec<Kind> = cells.par_iter().with_min_len(1 << 14).map(kind_of).collect();
+    occupied.bits.fill(0);
+    solid.bits.fill(0);
+    for (&i, kind) in cells.iter().zip(kinds) {
+        match kind {
+            Kind::Occupied => occupied.set(i, true),
+            Kind::Solid => solid.set(i, true),
+            Kind::Empty => {}
         }
     }
 }
