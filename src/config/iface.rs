@@ -118,7 +118,7 @@ table! {
         /// Neighboring samples of a ray share a color, that of the heaviest, until their weights sum
         /// to this (published: each has its own). At 0.05 a draft evaluates 0.4 times the colors,
         /// takes seven eighths of the CPU time, and loses 0.02 to 0.07 dB.
-        group_weight: f32 => 0.05, 0.0, 0.0, 0.05;
+        group_weight: f32 => 0.05, 0.0, 0.0;
         /// Half edge of the field's box.
         radius: f32 => 1.0, 1.0, 0.3;
         /// Initial surface.

@@ -186,6 +186,14 @@ fn tv_fade(config: &VmConfig, step: u64) -> f64 {
     0.1f64.powf((step + 1) as f64 / config.steps as f64)
 }
 
+/// Returns the weights of both grids' total variation at a step; `None` if it has no gradient there.
+fn penalties(config: &VmConfig, step: u64) -> Option<[f32; 2]> {
+    let every = config.tv_every;
+    // as much as of all steps up to the next
+    let weight = |weight: f64| (0.01 * weight * tv_fade(config, step) * every as f64) as f32;
+    step.is_multiple_of(every).then(|| [config.tv_density, config.tv_color].map(weight))
+}
+
 /// Resolvable detail as a share of a cell: interpolation between a cell's corners places outlines
 /// anywhere within it.
 pub(super) const DETAIL: f32 = 0.25;
@@ -252,12 +260,6 @@ impl<'a, O: VmOps> VmModel<'a, O> {
             (0..3).map(|a| (high[a] - low[a]) / self.state.size[a] as f32).fold(f32::INFINITY, f32::min);
         if 2 * step < self.config.steps { DETAIL * cell } else { 0.0 }
     }
-
-    /// Returns the weights of both grids' total variation at a step.
-    fn penalties(&self, step: u64) -> [f32; 2] {
-        let faded = tv_fade(self.config, step);
-        [self.config.tv_density, self.config.tv_color].map(|weight| (0.01 * weight * faded) as f32)
-    }
 }
 
 impl<O: VmOps> Model for VmModel<'_, O> {
@@ -270,14 +272,16 @@ impl<O: VmOps> Model for VmModel<'_, O> {
     }
 
     fn backward(&mut self, at: StepAt) {
-        let (detail, penalties) = (self.detail(at.step), self.penalties(at.step));
+        let (detail, penalties) = (self.detail(at.step), penalties(self.config, at.step));
         let groups = self.groups.as_mut().expect("parameters are loaded before the first step");
         let ops = &mut self.ops;
         ops.draw(at, self.config.rays_at(at.step), detail);
         ops.vm_render(groups);
         ops.losses(background_mode(self.config, at));
         ops.backward(groups);
-        ops.penalize(groups, penalties);
+        if let Some(penalties) = penalties {
+            ops.penalize(groups, penalties);
+        }
         self.unread += 1;
     }
 

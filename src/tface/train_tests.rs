@@ -152,6 +152,17 @@ fn published_rates_are_reproduced() {
 }
 
 #[test]
+fn the_total_variation_of_every_fourth_step_counts_as_that_of_four() {
+    let every = |tv_every| VmConfig { tv_every, tv_density: 2.0, ..VmConfig::preset(Preset::Draft) };
+    for step in 0..9 {
+        let [density, color] = penalties(&every(1), step).unwrap();
+        assert!(density == 2.0 * color && color > 0.0);
+        let want = step.is_multiple_of(4).then_some([4.0 * density, 4.0 * color]);
+        assert_eq!(penalties(&every(4), step), want, "{step}");
+    }
+}
+
+#[test]
 fn upsampling_starts_the_rates_again_from_the_next_step() {
     let config = config();
     let mut state = VmState::new(&config, 1, [[-1.0; 3], [1.0; 3]], None);
