@@ -115,9 +115,9 @@ table! {
         /// Weight along a ray above which the color of a sample counts, which is that of TensoRF;
         /// 0: each sample has its color (published).
         min_weight: f32 => 1e-4, 1e-4, 0.0;
-        /// Neighboring samples of a ray share a color, that of the heaviest, until their weights sum
-        /// to this (published: each has its own). At 0.05 a draft evaluates 0.4 times the colors,
-        /// takes seven eighths of the CPU time, and loses 0.02 to 0.07 dB.
+        /// Neighboring samples of a ray share a color, that of the heaviest, until their weights
+        /// sum to this (published: each has its own). At 0.05 a draft evaluates 0.4 times the
+        /// colors, takes seven eighths of the CPU time, and loses 0.02 to 0.07 dB.
         group_weight: f32 => 0.05, 0.0, 0.0;
         /// Half edge of the field's box.
         radius: f32 => 1.0, 1.0, 0.3;

@@ -186,7 +186,8 @@ fn tv_fade(config: &VmConfig, step: u64) -> f64 {
     0.1f64.powf((step + 1) as f64 / config.steps as f64)
 }
 
-/// Returns the weights of both grids' total variation at a step; `None` if it has no gradient there.
+/// Returns the weights of both grids' total variation at a step; `None` if it has no gradient
+/// there.
 fn penalties(config: &VmConfig, step: u64) -> Option<[f32; 2]> {
     let every = config.tv_every;
     // as much as of all steps up to the next

@@ -228,8 +228,8 @@ mod tests {
 
     #[test]
     fn skipping_empty_bricks_loses_no_sample() {
-        // 3 % of two thirds of 37³ cells, so that most bricks of 4³ have one, some are far from any;
-        // rays through all of the box
+        // 3 % of two thirds of 37³ cells, so that most bricks of 4³ have one, some are far from
+        // any; rays through all of the box
         let mut mask = BitGrid::filled(37, false);
         let draw = |i: usize| (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
         (0..37usize.pow(3)).filter(|&i| draw(i) % 1000 < 30 && i % 37 > 12).for_each(|i| mask.set(i, true));

@@ -237,8 +237,8 @@ pub fn weights(segments: Segments, field: &[f32], inv_s: f32, anneal: f32) -> Ve
     weights
 }
 
-/// Returns, for each sample, the sample whose color it takes: see [`ColorRule`]. Samples whose color
-/// does not count have [`COLORLESS`].
+/// Returns, for each sample, the sample whose color it takes: see [`ColorRule`]. Samples whose
+/// color does not count have [`COLORLESS`].
 ///
 /// # Shapes
 ///

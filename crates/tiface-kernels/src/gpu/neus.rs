@@ -126,8 +126,8 @@ fn give(sources: &mut [u32], start: usize, end: usize, from: usize) {
     }
 }
 
-/// Composites rays, and writes the transmittance at each sample to `light` and the sample whose color
-/// it takes to `sources`.
+/// Composites rays, and writes the transmittance at each sample to `light` and the sample whose
+/// color it takes to `sources`.
 #[cube(launch)]
 fn forward(
     offsets: &[u32],

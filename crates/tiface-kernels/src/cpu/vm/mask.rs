@@ -97,8 +97,8 @@ impl BoxMask {
         &self.bits
     }
 
-    /// Returns one bit per block of `edge`³ cells, set if the block contains an occupied cell, in the
-    /// order of cells.
+    /// Returns one bit per block of `edge`³ cells, set if the block contains an occupied cell, in
+    /// the order of cells.
     #[cfg(feature = "wgpu")]
     pub fn blocks(&self, edge: usize) -> Vec<u64> {
         let size = self.size.map(|n| n.div_ceil(edge));

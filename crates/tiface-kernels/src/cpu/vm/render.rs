@@ -372,8 +372,8 @@ fn rendered(
     Rendered { out, density_samples, color_samples: colors as u64, marched, decoded }
 }
 
-/// Gradients of a task's samples, without those that are exactly zero: cells, gradients with respect
-/// to the sum of plane times line, and those with respect to line values.
+/// Gradients of a task's samples, without those that are exactly zero: cells, gradients with
+/// respect to the sum of plane times line, and those with respect to line values.
 struct Gradients<'a> {
     cells: &'a mut [Cell],
     by_sum: &'a mut [f32],
