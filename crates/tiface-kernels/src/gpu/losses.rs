@@ -283,6 +283,7 @@ mod tests {
     use super::super::neus::Neus;
     use super::super::testing::{agree, device, planes};
     use super::*;
+    use crate::cpu::neus::ColorRule;
     use tiface_base::math::rng;
 
     const WEIGHTS: LossWeights = LossWeights {
@@ -407,7 +408,8 @@ mod tests {
             alive: device.upload(&[1u32, 1, 1, 1, 1, 0]),
             ..DeviceBatch::new(&device, 6)
         };
-        let (neus, losses) = (Neus::new(&device, 6, 24, 1e-4), Losses::new(&device, WEIGHTS, 6, 24));
+        let colors = ColorRule { min_weight: 1e-4, group_weight: 0.0 };
+        let (neus, losses) = (Neus::new(&device, 6, 24, colors), Losses::new(&device, WEIGHTS, 6, 24));
         let (count, g_s) = (device.upload(&[24u32]), device.zeros::<f32>(1));
         let composed = neus.forward(&device, &batch, &samples, &field, &sharp, ANNEAL as f32);
         let g_out = losses.of_rays(&device, composed, &batch, &samples.offsets);

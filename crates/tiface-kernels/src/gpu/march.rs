@@ -362,7 +362,7 @@ mod tests {
     fn rays_beyond_the_capacity_get_no_samples() {
         let Some(device) = device() else { return };
         let (mask, _, rays, jitter) = scene();
-        let whole = march(&mask, None, RADIUS, STEP, &rays, &jitter, 1000).offsets;
+        let whole = MarchCells::new(&mask, None).march(RADIUS, STEP, &rays, &jitter, 1000).offsets;
         let occupancy = Occupancy::new(&device, &mask, None, RADIUS);
         // rays from 300 on do not fit, except empty ones that directly follow
         let capacity = whole[300] + 1;

@@ -245,7 +245,9 @@ fn backward(
                 let from = 4 * plane + sources[s] as usize;
                 color = Vec3::read(field, plane, from);
                 let by_color = (g_rgb + color * (2.0f32 * g_squares)) * w;
-                (Vec3::read(g_field, plane, from) + by_color).write(g_field, plane, from);
+                g_field[from] += by_color.x;
+                g_field[plane + from] += by_color.y;
+                g_field[2 * plane + from] += by_color.z;
             }
             // from left to right, without brackets around the dot product of the normals
             let g_w = g_rgb.dot(color)

@@ -214,7 +214,7 @@ mod renderer_tests {
     use super::super::testing::{agree, device};
     use super::case_tests::{NARROW, case};
     use super::*;
-    use crate::cpu::vm::{DecoderWeights, render};
+    use crate::cpu::vm::{DecoderWeights, composited};
 
     #[test]
     fn rays_are_those_of_the_cpu_in_as_many_passes_as_there_is_room() {
