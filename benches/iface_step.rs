@@ -120,7 +120,7 @@ fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 7]) -> usize 
         Targets { offsets: &i.offsets, color: &i.directions, alpha: &i.alpha, background: &i.directions };
     let (_, g_out) = losses::of_rays(&out, targets, &WEIGHTS);
     lap(2);
-    let (mut g_field, _) = neus::backward(segments, a.output(), &sources, 20.0, 0.5, &g_out);
+    let (mut g_field, _) = neus::composite_backward(segments, a.output(), &sources, 20.0, 0.5, &g_out);
     lap(1);
     losses::of_samples(a.output(), &WEIGHTS, &mut g_field);
     lap(2);

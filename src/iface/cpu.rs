@@ -236,7 +236,7 @@ impl SdfOps for CpuSdf<'_> {
         let n = step.samples.t.len();
         let segments = step.segments(color_rule(self.config));
         let (mut g_field, g_inv_s) =
-            neus::backward(segments, field, &step.sources, self.inv_s, anneal, &g_composed);
+            neus::composite_backward(segments, field, &step.sources, self.inv_s, anneal, &g_composed);
         let (of_samples, of_points) = g_field.split_at_mut(n * WIDTH);
         let of_samples = losses::of_samples(&field[..n * WIDTH], &w, of_samples);
         let points: Vec<[f32; 2]> = step.points.iter().map(|p| [p.footprint, p.weight]).collect();

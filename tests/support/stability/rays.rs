@@ -6,7 +6,7 @@ use glam::{DMat3, DVec3, Vec2, Vec3};
 use tiface::geom::{BitGrid, Bvh, Camera, Distortion, Mesh, Ray};
 use tiface::kernel::cpu::hash;
 use tiface::kernel::cpu::march::march;
-use tiface::kernel::cpu::neus::{self, Segments};
+use tiface::kernel::cpu::neus::{self, ColorRule, Segments};
 use tiface::kernel::cpu::vm::mask::{Lattice, Walk};
 use tiface::math::rng;
 use tiface::mesh::{Volume, marching};
@@ -231,7 +231,7 @@ fn spheres(cases: &mut Cases) {
                 direction: &[r.direction.to_array()],
                 t: &samples.t,
                 dt: &dt,
-                min_weight: 0.0,
+                colors: ColorRule { min_weight: 0.0, group_weight: 0.0 },
             };
             let out = neus::forward(segments, &field, inv_s, 1.0);
             (out[3] as f64, (out[4] / out[3]) as f64)

@@ -4,7 +4,7 @@
 use super::case::{Cases, StabilityCase, relative, worst};
 use super::reference::{neus::composite, wide};
 use std::array::from_fn;
-use tiface::kernel::cpu::neus::{self, Segments};
+use tiface::kernel::cpu::neus::{self, ColorRule, Segments};
 use tiface::kernel::cpu::sdf::WIDTH;
 use tiface::math::rng;
 
@@ -52,7 +52,7 @@ impl Bundle {
             direction: &self.direction,
             t: &self.t,
             dt: &self.dt,
-            min_weight: 0.0,
+            colors: ColorRule { min_weight: 0.0, group_weight: 0.0 },
         }
     }
 

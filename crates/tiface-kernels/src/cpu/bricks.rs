@@ -201,7 +201,7 @@ impl BrickWalk {
             border = border.min((wall as f32 - g[a]) * self.steps[a] + self.never[a]);
         }
         // slightly less than that, so that rounding cannot skip a point in the next cell
-        let whole = (border - 1e-3).ceil().max(1.0).min(1e9);
+        let whole = (border - 1e-3).ceil().clamp(1.0, 1e9);
         whole as i32
     }
 }

@@ -413,14 +413,15 @@ dispatch! {
     )
 }
 
-/// Returns the gradients with respect to the field's output, `[n, 8]`, and with respect to `inv_s`.
+/// Returns the gradients of [`composite`] by [`weights`] with respect to the field's output, `[n,
+/// 8]`, and with respect to `inv_s`.
 ///
 /// # Shapes
 ///
 /// - field: `[n, 8]`, the output of the field; the gradient of rows beyond the samples is zero
 /// - sources: `[samples]`, as [`color_sources`] returns them
 /// - g_out: `[rays, 9]`, the gradient of the loss with respect to the output of [`composite`]
-pub fn backward(
+pub fn composite_backward(
     segments: Segments,
     field: &[f32],
     sources: &[u32],
@@ -438,6 +439,12 @@ pub fn backward(
     let total: f64 = tasks.iter().flat_map(|t| &t.g_ln_inv_s).sum();
     let inside = (1e-6..=1e6).contains(&inv_s);
     (g_field, if inside { (total / inv_s as f64) as f32 } else { 0.0 })
+}
+
+/// Returns the gradients of [`forward`]: see [`composite_backward`].
+pub fn backward(segments: Segments, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32]) -> (Buffer, f32) {
+    let sources = color_sources(segments, &weights(segments, field, inv_s, anneal));
+    composite_backward(segments, field, &sources, inv_s, anneal, g_out)
 }
 
 #[cfg(test)]
@@ -483,7 +490,7 @@ mod tests {
                         composited.iter().all(|v| v.is_finite() && v.abs() < 2.0),
                         "{inv_s} {sdf} {slope} {composited:?}"
                     );
-                    let (g_field, g_s) = gradients(segments, &field, inv_s, 1.0, &g);
+                    let (g_field, g_s) = backward(segments, &field, inv_s, 1.0, &g);
                     let gradients = || g_field.iter().chain([&g_s]);
                     assert!(gradients().all(|v| v.is_finite()), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
                     // 3 · 1e6, the unit normal's 1 / MIN_GRADIENT_NORM, and 1e3 · 1e6 by the length
@@ -495,12 +502,6 @@ mod tests {
                 }
             }
         }
-    }
-
-    /// Returns the gradients of the last forward pass.
-    fn gradients(segments: Segments, field: &[f32], inv_s: f32, anneal: f32, g: &[f32]) -> (Buffer, f32) {
-        let sources = color_sources(segments, &weights(segments, field, inv_s, anneal));
-        backward(segments, field, &sources, inv_s, anneal, g)
     }
 
     #[test]
@@ -553,7 +554,7 @@ mod tests {
         for group_weight in [0.0, 0.1] {
             let colors = ColorRule { min_weight: 1e-4, group_weight };
             let segments = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, colors };
-            let (g_field, g_s) = gradients(segments, &field, inv_s, anneal, &g);
+            let (g_field, g_s) = backward(segments, &field, inv_s, anneal, &g);
             let faint = |w: &f32| *w <= colors.min_weight;
             assert!(faint(&weights(segments, &field, inv_s, anneal)[4]) && g_field[36..39] == [0.0; 3]);
             assert!(g_field[32] != 0.0, "its opacity counts");

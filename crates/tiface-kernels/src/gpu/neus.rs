@@ -443,8 +443,7 @@ mod tests {
         ));
         let flat = field.as_flattened();
         let want = neus::forward(segments, flat, inv_s, anneal);
-        let sources = neus::color_sources(segments, &neus::weights(segments, flat, inv_s, anneal));
-        let (want_field, want_s) = neus::backward(segments, flat, &sources, inv_s, anneal, g.as_flattened());
+        let (want_field, want_s) = neus::backward(segments, flat, inv_s, anneal, g.as_flattened());
         let [want, want_field] =
             [planes::<RAY_WIDTH>(want.as_chunks().0, count), planes::<WIDTH>(want_field.as_chunks().0, n)];
         [(out, g_field, device.read::<f32>(&g_s)[0]), (want, want_field, want_s)]

@@ -383,13 +383,12 @@ struct Gradients<'a> {
 #[inline(always)]
 fn gradients_body<const F: bool>(m: &Marched, g: &[f32], out: &mut Gradients) {
     let n = out.lines.len() / out.by_sum.len().max(1);
-    let mut k = 0;
-    for (i, &g) in g.iter().enumerate().filter(|(_, g)| **g != 0.0) {
+    let kept = g.iter().enumerate().filter(|(_, g)| **g != 0.0);
+    for (k, (i, &g)) in kept.enumerate() {
         (out.cells[k], out.by_sum[k]) = (m.cells[i], g);
         for (line, plane) in out.lines[k * n..][..n].iter_mut().zip(&m.planes[i * n..][..n]) {
             *line = g * plane;
         }
-        k += 1;
     }
 }
 
