@@ -1,7 +1,7 @@
 //! A whole optimizer step against the same arithmetic in f64: sampling, field, compositing, every
 //! loss term, weight norm and the groups of AdamW, parameter by parameter.
 
-use super::super::ops::STEREO_POINTS;
+use super::super::ops::{STEREO_POINTS, color_rule};
 use super::super::stereo::SurfacePoint;
 use super::*;
 use crate::config::Preset;
