@@ -5,7 +5,7 @@ use super::case::{Cases, StabilityCase, worst};
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use tiface::geom::{BitGrid, Bvh, Camera, Distortion, Mesh, Ray};
 use tiface::kernel::cpu::hash;
-use tiface::kernel::cpu::march::march;
+use tiface::kernel::cpu::march::MarchCells;
 use tiface::kernel::cpu::neus::{self, ColorRule, Segments};
 use tiface::kernel::cpu::vm::mask::{Lattice, Walk};
 use tiface::math::rng;
@@ -184,7 +184,9 @@ fn boxes(cases: &mut Cases) {
         let r = Ray::new(origin, direction);
         let chord = chord(origin.as_dvec3(), direction.as_dvec3());
         let want = chord / step as f64;
-        cubic.push((march(&full, None, 1.0, step, &[r], &[], 1 << 20).t.len() as f64 - want).abs());
+        cubic.push(
+            (MarchCells::new(&full, None).march(1.0, step, &[r], &[], 1 << 20).t.len() as f64 - want).abs(),
+        );
         let mut walk = Walk::new(&lattice, None, &r, 0.0);
         let mut n = 0;
         while walk.advance().is_some() {
@@ -215,7 +217,7 @@ fn spheres(cases: &mut Cases) {
     for (inv_s, step) in [(200.0f32, 0.004f32), (2000.0, 0.001), (1e6, 0.001)] {
         let see = |height: f32| {
             let r = Ray::new([height, 0.0, 2.0], [0.0, 0.0, -1.0]);
-            let samples = march(&full, None, 1.0, step, &[r], &[0.37], 1 << 20);
+            let samples = MarchCells::new(&full, None).march(1.0, step, &[r], &[0.37], 1 << 20);
             let (x, _) = samples.points(&[r]);
             let field: Vec<f32> = x
                 .iter()
