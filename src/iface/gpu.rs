@@ -157,7 +157,7 @@ pub(super) fn max_samples(
 ) -> Result<(usize, bool)> {
     /// Words per sample outside the field: positions, directions, steps, compositing, losses, and
     /// the index of the cell that takes the sample's place during an occupancy update.
-    const EXTRA_WORDS: usize = 3 + 3 + 2 + 9 + 2 + 1;
+    const EXTRA_WORDS: usize = 3 + 3 + 2 + 10 + 2 + 1;
     let [words, widest] = Sdf::words_per_sample(shape);
     let points = stereo_points(config);
     let sums = Sdf::words_of_sums(shape, wanted_samples(config, points));

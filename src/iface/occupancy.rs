@@ -21,7 +21,7 @@ pub struct Occupancy {
     /// Decaying maximum of the opacity (`nerfacc` rule), `[cells]`.
     pub history: Vec<f32>,
     /// Occupied and solid cells, for rays.
-    of_rays: MarchCells,
+    march_cells: MarchCells,
 }
 
 /// Returns the rule for the width of the band around the zero set.
@@ -68,8 +68,8 @@ impl Occupancy {
             OccupancyRule::Nerfacc => vec![0.0; r * r * r],
         };
         let solid = BitGrid::filled(r, false);
-        let of_rays = MarchCells::new(&allowed, Some(&solid));
-        Occupancy { occupied: allowed.clone(), solid, allowed, history, of_rays }
+        let march_cells = MarchCells::new(&allowed, None);
+        Occupancy { occupied: allowed.clone(), solid, allowed, history, march_cells }
     }
 
     /// Replaces occupied and solid cells.
@@ -81,7 +81,9 @@ impl Occupancy {
 
     /// Prepares changed cells for rays.
     fn prepare(&mut self) {
-        self.of_rays = MarchCells::new(&self.occupied, Some(&self.solid));
+        // the nerfacc rule has a history and no solid cells
+        let solid = self.history.is_empty().then_some(&self.solid);
+        self.march_cells = MarchCells::new(&self.occupied, solid);
     }
 
     /// Writes cells and their history into a checkpoint.
@@ -161,7 +163,7 @@ impl Occupancy {
     /// Marches rays through the occupied cells, with steps of `dt`; see [`MarchCells::march`].
     pub fn march(&self, config: &IfaceConfig, dt: f32, rays: &[Ray], jitter: &[f32]) -> Samples {
         let limit = (3.6 * config.radius / dt) as usize + 2;
-        self.of_rays.march(config.radius, dt, rays, jitter, limit)
+        self.march_cells.march(config.radius, dt, rays, jitter, limit)
     }
 
     /// Returns the share of cells that are occupied.

@@ -33,8 +33,8 @@ fn paper() -> IfaceConfig {
     }
 }
 
-/// All that is not published: softness, random backgrounds, colors of single samples, points of
-/// stereo.
+/// All that is not published: softness, random backgrounds, colors of single samples and of groups,
+/// points of stereo.
 fn ours() -> IfaceConfig {
     let draft = IfaceConfig::preset(Preset::Draft);
     IfaceConfig {
@@ -50,6 +50,8 @@ fn ours() -> IfaceConfig {
         sparsity: 0.2,
         sparsity_scale: 50.0,
         weight_decay: 0.0,
+        min_weight: draft.min_weight,
+        group_weight: draft.group_weight,
         ..paper()
     }
 }

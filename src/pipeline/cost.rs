@@ -186,7 +186,7 @@ impl<'a> Workload<'a> {
         };
         // samples along a ray are as dense as the grid, or `step_ratio` times as far apart; many of
         // them share a color
-        let sample = if c.group_weight > 0.0 { 0.04e-6 } else { 0.045e-6 } / c.step_ratio;
+        let sample = if c.group_weight > 0.0 { 0.036e-6 } else { 0.045e-6 } / c.step_ratio;
         let ray = outside * (3e-6 + sample * (c.voxels_final as f64).cbrt());
         let cpu_s = 0.1 + ray * rays + 4e-9 * parameters * (c.steps as usize * c.learned()) as f64;
         let trained = mib::VM_PARAMETER * parameters + mib::VM_RAY * c.rays as f64;
@@ -200,7 +200,9 @@ impl<'a> Workload<'a> {
         let (c, all) = (&self.config.iface, self.all);
         let samples = (c.steps as usize * c.samples) as f64;
         let table = ((c.levels as u64 * 2) << c.log2_table.min(32)) as f64;
-        let cpu_s = 3.8 + 1.5e-6 * samples + 1.3e-9 * table * c.steps as f64 + 1.8e-6 * all;
+        // many samples share a color
+        let sample = if c.group_weight > 0.0 { 1.3e-6 } else { 1.5e-6 };
+        let cpu_s = 3.8 + sample * samples + 1.3e-9 * table * c.steps as f64 + 1.8e-6 * all;
         let trained = mib::TABLE_FLOAT * table + mib::SDF_SAMPLE * c.samples as f64;
         (cpu_s, mib::PIXEL * all + trained)
     }

@@ -190,7 +190,7 @@ fn tv_fade(config: &VmConfig, step: u64) -> f64 {
 /// there.
 fn penalties(config: &VmConfig, step: u64) -> Option<[f32; 2]> {
     let every = config.tv_every;
-    // as much as of all steps up to the next
+    // the mean stays that of a gradient at every step
     let weight = |weight: f64| (0.01 * weight * tv_fade(config, step) * every as f64) as f32;
     step.is_multiple_of(every).then(|| [config.tv_density, config.tv_color].map(weight))
 }

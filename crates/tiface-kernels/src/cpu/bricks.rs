@@ -8,6 +8,11 @@ use tiface_base::geom::Ray;
 /// Number of cells along the edge of a brick, a power of two.
 const BRICK: usize = 4;
 
+/// Returns x, y and z of a cell of a box.
+pub(crate) fn coordinates(cell: usize, [_, ny, nz]: [usize; 3]) -> [usize; 3] {
+    [cell / (ny * nz), cell / nz % ny, cell % nz]
+}
+
 /// Returns the indices of the set bits.
 pub(crate) fn set_bits(bits: &[u64]) -> impl Iterator<Item = usize> {
     bits.iter().enumerate().flat_map(|(i, &word)| {
@@ -40,19 +45,20 @@ impl Bricks {
     /// Creates bricks from the bits of cells, whose cell `(x, y, z)` has index `(x · ny + y) · nz +
     /// z`. `ends` are the cells in which rays end, `[0]` if they end in none.
     pub fn new(size: [usize; 3], occupied: &[u64], ends: &[u64]) -> Bricks {
+        assert!(size.iter().all(|&n| n > 0 && n < 1 << 24), "cells of an axis are counted in f32");
         let bricks = size.map(|n| n.div_ceil(BRICK));
         let count = bricks.iter().product();
         let words = |bits: &[u64]| {
             let mut words = vec![0u64; count];
             for i in set_bits(bits) {
-                let [x, y, z] = [i / (size[1] * size[2]), i / size[2] % size[1], i % size[2]];
+                let [x, y, z] = coordinates(i, size);
                 let brick = (x / BRICK * bricks[1] + y / BRICK) * bricks[2] + z / BRICK;
                 words[brick] |= 1 << ((x % BRICK * BRICK + y % BRICK) * BRICK + z % BRICK);
             }
             words
         };
         let occupied = words(occupied);
-        let ends = if ends.is_empty() { Vec::new() } else { words(ends) };
+        let ends = if ends.iter().any(|word| *word != 0) { words(ends) } else { Vec::new() };
         let marked = |i: usize| occupied[i] != 0 || ends.get(i).is_some_and(|word| *word != 0);
         let distance = distances(bricks, (0..count).map(marked));
         Bricks { size, bricks, occupied, ends, distance }
@@ -68,7 +74,7 @@ fn distances(size: [usize; 3], marked: impl Iterator<Item = bool>) -> Vec<u8> {
     let mut distance: Vec<u8> = marked.map(|marked| if marked { 0 } else { u8::MAX }).collect();
     let near = |at: usize, count: usize| at.saturating_sub(1)..(at + 2).min(count);
     let mut visit = |i: usize| {
-        let [x, y, z] = [i / (size[1] * size[2]), i / size[2] % size[1], i % size[2]];
+        let [x, y, z] = coordinates(i, size);
         if distance[i] == 0 {
             return;
         }
@@ -140,7 +146,7 @@ impl BrickWalk {
     /// Returns what the ray finds at successive points `t`; outside of the box, empty cells.
     #[inline(always)]
     pub fn find(&self, bricks: &Bricks, t: &Positions) -> Found {
-        // each loop is of one type of number, or it would not become one of vectors
+        // one type of number per loop, so that the compiler vectorizes it
         let mut g = [[0f32; POINTS]; 3];
         let mut outside = [0f32; POINTS];
         let (mut brick, mut bit) = ([0i32; POINTS], [0i32; POINTS]);
@@ -155,7 +161,7 @@ impl BrickWalk {
             }
             for i in 0..POINTS {
                 // SAFETY: the bounds keep positions far outside the box, and NaN, in the range of
-                // i32.
+                // i32, as the number of cells is.
                 cell[i] = unsafe { g[a][i].max(0.0).min(top - 1.0).to_int_unchecked() };
             }
             for i in 0..POINTS {

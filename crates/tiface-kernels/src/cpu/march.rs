@@ -140,7 +140,8 @@ fn march_one(
         enter = enter.max(p.min(q));
         leave = leave.min(p.max(q));
     }
-    if enter.is_nan() || leave.is_nan() || enter >= leave || !step.is_finite() || step <= 0.0 {
+    let finite = ray.origin.is_finite() && ray.direction.is_finite() && step.is_finite();
+    if !finite || enter >= leave || step <= 0.0 {
         return;
     }
     let walk = BrickWalk::new(bricks, [[-radius; 3], [radius; 3]], ray, step);
@@ -233,6 +234,11 @@ mod tests {
         let mut mask = BitGrid::filled(37, false);
         let draw = |i: usize| (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
         (0..37usize.pow(3)).filter(|&i| draw(i) % 1000 < 30 && i % 37 > 12).for_each(|i| mask.set(i, true));
+        // a few where rays end, most of them in bricks without any other
+        let mut solid = BitGrid::filled(37, false);
+        let ends = |&i: &usize| draw(i) % 1000 > 994 && !mask.get(i);
+        (0..37usize.pow(3)).filter(ends).for_each(|i| solid.set(i, true));
+        let mut ended = 0;
         let mut kept = 0;
         for i in 0..200 {
             let unit = |k: usize| draw(i * 8 + k) as f32 / (1 << 24) as f32;
@@ -246,11 +252,15 @@ mod tests {
                 let c = |a: usize| ((ray.origin[a] + t * ray.direction[a] + 1.0) * 18.5) as i32;
                 [0, 1, 2].iter().fold(0, |i, &a| i * 37 + c(a).clamp(0, 36) as usize)
             };
-            let want: Vec<f32> = all.into_iter().filter(|&t| mask.get(cell(t))).collect();
+            let want: Vec<f32> = all.iter().copied().filter(|&t| mask.get(cell(t))).collect();
             assert_eq!(march(&mask, None, 0.01, &[ray], &jitter, 1000).t, want);
             kept += want.len();
+            let to_end: Vec<f32> = all.iter().copied().take_while(|&t| !solid.get(cell(t))).collect();
+            let want: Vec<f32> = to_end.iter().copied().filter(|&t| mask.get(cell(t))).collect();
+            assert_eq!(march(&mask, Some(&solid), 0.01, &[ray], &jitter, 1000).t, want);
+            ended += usize::from(to_end.len() < all.len());
         }
-        assert!(kept > 100, "{kept}");
+        assert!(kept > 100 && (20..180).contains(&ended), "{kept} {ended}");
     }
 
     #[test]

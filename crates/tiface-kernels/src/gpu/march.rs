@@ -1,6 +1,6 @@
-//! Marching through the occupancy bitmask of [`crate::cpu::march`], without a readback of the
-//! number of samples: a first pass counts the samples of each ray, a prefix sum gives the offset of
-//! each ray, and a second pass writes the samples.
+//! Marching through an occupancy bitmask, with the samples of [`crate::cpu::march`], without a
+//! readback of the number of samples: a first pass counts the samples of each ray, a prefix sum
+//! gives the offset of each ray, and a second pass writes the samples.
 
 use super::batch::DeviceBatch;
 use super::device::{Buffer, Device, Words, groups, launch};
@@ -134,7 +134,9 @@ fn pass(
                     marching = found < max_count;
                 } else {
                     let far = min(border(g.x, cx, d.x), min(border(g.y, cy, d.y), border(g.z, cz, d.z)));
-                    let skip = max((max(far, 0.0f32) / (scale * step)).ceil(), 1.0f32);
+                    // slightly less than that, so that rounding cannot skip a sample in the next
+                    // cell
+                    let skip = max((max(far, 0.0f32) / (scale * step) - 1e-3f32).ceil(), 1.0f32);
                     k += u32::cast_from(min(skip, 1e9f32));
                     if has_solid && bit(solid, i) {
                         marching = false;

@@ -26,7 +26,7 @@ impl Cell {
             // unlike `clamp`, `max` and `min` also bound NaN
             let x = (unit[a] * top).max(0.0).min(top);
             // SAFETY: the bounds keep the number in the range of i32.
-            let i = unsafe { x.to_int_unchecked::<i32>() }.min(size[a] as i32 - 2);
+            let i = unsafe { x.min(1e9).to_int_unchecked::<i32>() }.min(size[a] as i32 - 2);
             cell.index[a] = i as u32;
             cell.frac[a] = x - i as f32;
         }
@@ -84,12 +84,12 @@ fn look_up<const F: bool, const W: usize>(
     for k in 0..W {
         plane[k] = fma::<F>(w[3], e[k], fma::<F>(w[2], d[k], fma::<F>(w[1], b[k], w[0] * a[k])));
     }
-    (plane, mixed::<F, W>(l, m, z))
+    (plane, lerp::<F, W>(l, m, z))
 }
 
 /// `a + t (b − a)` for each channel.
 #[inline(always)]
-fn mixed<const F: bool, const W: usize>(a: &[f32; W], b: &[f32; W], t: f32) -> [f32; W] {
+fn lerp<const F: bool, const W: usize>(a: &[f32; W], b: &[f32; W], t: f32) -> [f32; W] {
     let mut out = [0f32; W];
     for k in 0..W {
         out[k] = fma::<F>(t, b[k] - a[k], a[k]);
@@ -163,7 +163,7 @@ impl<'a> Lookup<'a> {
             in_pieces!(channels, c, W, {
                 let (mut p, v) = look_up::<F, W>(term, &at, line, cell.frac[axis], c);
                 if KEEP {
-                    // as of the sums below
+                    // without the black box the compiler splits the products into scalars
                     p = std::hint::black_box(p);
                     planes[first + c..first + c + W].copy_from_slice(&p);
                 }
@@ -193,7 +193,7 @@ impl<'a> Lookup<'a> {
     fn line_values<const F: bool, const N: usize>(&self, term: usize, cell: &Cell) -> [f32; N] {
         let (values, axis) = (self.terms[term].line, LINE_AXIS[term]);
         let at = cell.index[axis] as usize * N;
-        mixed::<F, N>(lanes(values, at), lanes(values, at + N), cell.frac[axis])
+        lerp::<F, N>(lanes(values, at), lanes(values, at + N), cell.frac[axis])
     }
 
     /// Writes the line values of all channels of a term.
@@ -203,7 +203,7 @@ impl<'a> Lookup<'a> {
         let at = cell.index[axis] as usize * n;
         in_pieces!(n, c, W, {
             let value: [f32; W] =
-                mixed::<F, W>(lanes(values, at + c), lanes(values, at + n + c), cell.frac[axis]);
+                lerp::<F, W>(lanes(values, at + c), lanes(values, at + n + c), cell.frac[axis]);
             out[c..c + W].copy_from_slice(&value);
         });
     }

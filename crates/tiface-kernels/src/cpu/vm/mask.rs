@@ -6,9 +6,9 @@
 //! *before* the field is evaluated. Sample positions `t = entry + step · (k + jitter)` do not
 //! depend on the mask.
 
-#[cfg(feature = "wgpu")]
-use crate::cpu::bricks::set_bits;
 use crate::cpu::bricks::{BrickWalk, Bricks, POINTS};
+#[cfg(feature = "wgpu")]
+use crate::cpu::bricks::{coordinates, set_bits};
 use tiface_base::geom::Ray;
 
 /// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`.
@@ -47,11 +47,14 @@ impl BoxMask {
     }
 
     /// Creates a mask from its bits, as [`BoxMask::bits`] returns them; `None` if their number does
-    /// not fit the cells.
-    pub fn from_bits(min: [f32; 3], max: [f32; 3], size: [usize; 3], bits: Vec<u64>) -> Option<BoxMask> {
+    /// not fit the cells. Bits after the last cell are cleared.
+    pub fn from_bits(min: [f32; 3], max: [f32; 3], size: [usize; 3], mut bits: Vec<u64>) -> Option<BoxMask> {
         let count = size.iter().try_fold(1usize, |n, &s| n.checked_mul(s))?;
         if bits.len() != count.div_ceil(64) {
             return None;
+        }
+        if let Some(last) = bits.last_mut().filter(|_| !count.is_multiple_of(64)) {
+            *last &= (1 << (count % 64)) - 1;
         }
         let bricks = Bricks::new(size, &bits, &[]);
         Some(BoxMask { min, max, size, bits, bricks })
@@ -104,8 +107,7 @@ impl BoxMask {
         let size = self.size.map(|n| n.div_ceil(edge));
         let mut blocks = vec![0; size.iter().product::<usize>().div_ceil(64)];
         for cell in set_bits(&self.bits) {
-            let [ny, nz] = [self.size[1], self.size[2]];
-            let [x, y, z] = [cell / (ny * nz), cell / nz % ny, cell % nz].map(|c| c / edge);
+            let [x, y, z] = coordinates(cell, self.size).map(|c| c / edge);
             let i = (x * size[1] + y) * size[2] + z;
             blocks[i >> 6] |= 1 << (i & 63);
         }
@@ -227,7 +229,8 @@ impl<'a> Walk<'a> {
         }
         let of_ray =
             |m: &'a BoxMask| (&m.bricks, BrickWalk::new(&m.bricks, [m.min, m.max], ray, lattice.step));
-        let any = crossing.is_some() && start.is_finite();
+        let finite = ray.origin.is_finite() && ray.direction.is_finite();
+        let any = crossing.is_some() && start.is_finite() && finite;
         let last = lattice.samples.saturating_sub(1).try_into().unwrap_or(i32::MAX);
         Walk {
             mask: mask.map(of_ray),

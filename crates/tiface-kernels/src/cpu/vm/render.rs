@@ -323,13 +323,14 @@ fn rendered(
     assert!(jitter.is_empty() || jitter.len() == rays.len());
     let lookup = Lookup::new(&field.density, density);
     assert_eq!(lookup.size(), field.color.size);
+    let channels = field.density.channels();
     let march = |(task, rays): (usize, &[Ray])| {
         let jitter = jitter.get(task * RAYS..task * RAYS + rays.len()).unwrap_or(&[]);
         let mut marched = Marched {
             kept: Vec::with_capacity(rays.len() * 32),
             cells: Vec::with_capacity(rays.len() * 32),
             keeps_planes,
-            planes: Vec::new(),
+            planes: Vec::with_capacity(if keeps_planes { rays.len() * 16 * channels } else { 0 }),
             offsets: vec![0],
             color_of: Vec::new(),
             colored: Vec::new(),

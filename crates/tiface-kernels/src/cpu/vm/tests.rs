@@ -56,6 +56,7 @@ fn rendered_rays_have_the_published_values() {
     let rays =
         [Ray::new([0.1, -0.2, 4.5], [0.02, 0.05, -1.0]), Ray::new([0.3, 0.4, 4.2], [-0.1, 0.02, -1.0])];
     let out = render(&f, &density(), &color(), &weights, &rays, &[]).out;
+    assert_eq!(composited(&f, &density(), &color(), &weights, &rays), out);
     // rgb over black, over white, depth with the published code's extra (1 − opacity) d_z
     let golden = [
         ([0.5031043, 0.5020230, 0.4993656], [0.5031812, 0.5020999, 0.4994425], 3.6129913),
@@ -216,8 +217,10 @@ fn a_mask_removes_samples_and_moves_none() {
         let masks_left = &mut left[mask];
         let mask = &masks[mask];
         let u = |k: u64| rng::uniform(9, 1, 8 * i + k) - 0.5;
-        let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(0), 0.8 * u(1), -1.0] };
-        let ray = Ray::new([u(2), u(3), 3.0], direction);
+        // down and up
+        let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
+        let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(0), 0.8 * u(1), -sign] };
+        let ray = Ray::new([u(2), u(3), 3.0 * sign], direction);
         let points = |mask: Option<&BoxMask>| {
             let mut walk = Walk::new(&lattice, mask, &ray, u(4) + 0.5);
             std::iter::from_fn(|| walk.advance()).collect::<Vec<f32>>()
@@ -236,6 +239,34 @@ fn a_mask_removes_samples_and_moves_none() {
         assert!(differing <= 1, "ray {i}: {differing} of {}", want.len());
     }
     assert!(hit_rays > 60 && left[0] > 5 * left[1] && left[1] > 10, "{hit_rays} {left:?}");
+}
+
+#[test]
+fn a_ray_that_is_not_finite_has_no_points() {
+    let lattice = Lattice { min: [-1.0; 3], max: [1.0; 3], step: 0.1, samples: 40, near: 0.0, far: 9.0 };
+    let mask = BoxMask::new([-1.0; 3], [1.0; 3], [8; 3], |_| true);
+    let points = |ray: Ray| {
+        let mut walk = Walk::new(&lattice, Some(&mask), &ray, 0.5);
+        std::iter::from_fn(|| walk.advance()).count()
+    };
+    let (from, along) = ([0.1, 0.2, 3.0], [0.0, 0.1, -1.0]);
+    assert!(points(Ray::new(from, along)) > 10);
+    for wrong in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        for axis in 0..3 {
+            let with = |mut v: [f32; 3]| {
+                v[axis] = wrong;
+                v
+            };
+            assert_eq!(points(Ray::new(with(from), along)) + points(Ray::new(from, with(along))), 0);
+        }
+    }
+}
+
+#[test]
+fn bits_after_the_last_cell_are_cleared() {
+    let mask = BoxMask::from_bits([0.0; 3], [1.0; 3], [4, 3, 5], vec![u64::MAX]).unwrap();
+    assert_eq!((mask.bits(), mask.share()), (&[(1 << 60) - 1][..], 1.0));
+    assert!(BoxMask::from_bits([0.0; 3], [1.0; 3], [4, 3, 5], vec![0; 2]).is_none());
 }
 
 #[test]
