@@ -177,9 +177,9 @@ table! {
         /// CPU time and loses 0.01 to 0.08 dB; at 0.02 it takes three quarters and is as good or
         /// 0.05 dB better.
         group_weight: f64 => 0.05, 0.02, 0.0;
-        /// Steps from one gradient of the total variation to the next, each multiplied by this number
-        /// (published: 1). Under Adam the effect is weaker where this gradient dominates. At 4 a
-        /// draft's training takes some 3 % less CPU time, and its views are as good.
+        /// Steps from one gradient of the total variation to the next, each multiplied by this
+        /// number (published: 1). Under Adam the effect is weaker where this gradient dominates. At
+        /// 4 a draft's training takes some 3 % less CPU time, and its views are as good.
         tv_every: u64 => 4, 1, 1;
         /// A ray ends where less than this of its light is left.
         stop: f64 => 1e-3, 1e-3, 0.0;
