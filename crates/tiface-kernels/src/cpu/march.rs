@@ -16,7 +16,7 @@ pub(crate) fn shift(jitter: &[f32], ray: usize) -> f32 {
 }
 
 /// Index of the color of a sample that weighs so little on its ray that it has none.
-pub(crate) const COLORLESS: u32 = u32::MAX;
+pub const COLORLESS: u32 = u32::MAX;
 
 /// The samples of a batch of rays, sorted by ray and then by `t`.
 #[derive(Clone, Debug, Default)]
