@@ -92,6 +92,14 @@ impl<'a> VisibleHead<'a> {
         self.views(camera, options, 1, colors).remove(0)
     }
 
+    /// Rasterizes what ray casting shows of the head without residuals, with depth in the mesh's
+    /// units and without normals.
+    fn rasterized(&self, camera: &Camera) -> RenderedView {
+        let options = RasterOptions { normals: false, bare_hits: true, ..RasterOptions::default() };
+        let colors = |hits: &RayHits| self.colors(&[Method::Raycast], hits, camera, 1).remove(0);
+        raster(&self.head.mesh, self.layers.as_ref(), camera, &options, colors).view
+    }
+
     /// Returns the sRGB-coded base colors of hits: the texture's or the vertices', else gray, lit
     /// from the camera.
     fn base_colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
@@ -228,7 +236,12 @@ impl<'a> Renderer<'a> {
             }
             let loaded = learn::training_view(view, &tiles, scene)?;
             let (camera, mask, valid) = (&loaded.camera, loaded.mask.as_ref(), loaded.valid.as_ref());
-            if let Some(view) = self.cast(&[Method::Raycast], camera, &options)?.pop() {
+            // pixels are compared by their centers, so rasterizing is as good
+            let view = match &self.head {
+                Some(head) if self.extracted.is_none() => Some(head.rasterized(camera)),
+                _ => self.cast(&[Method::Raycast], camera, &options)?.pop(),
+            };
+            if let Some(view) = view {
                 let source = ResidualSource { camera, photo: &loaded.photo, mask, valid, view };
                 residuals.extend(ResidualView::new(source));
             }

@@ -120,6 +120,25 @@ pub fn write_exr(
     height: u32,
     channels: &[(&str, &[f32])],
 ) -> Result<(), WriteError> {
+    write_compressed(path, [width, height], channels, ex::Compression::ZIP16)
+}
+
+/// As [`write_exr`], run-length encoded: a fifth larger for views of heads, and sooner done.
+pub fn write_exr_quickly(
+    path: &Path,
+    width: u32,
+    height: u32,
+    channels: &[(&str, &[f32])],
+) -> Result<(), WriteError> {
+    write_compressed(path, [width, height], channels, ex::Compression::RLE)
+}
+
+fn write_compressed(
+    path: &Path,
+    [width, height]: [u32; 2],
+    channels: &[(&str, &[f32])],
+    compression: ex::Compression,
+) -> Result<(), WriteError> {
     let content = |problem: String| WriteError::content(path, problem);
     let pixels = width as usize * height as usize;
     if pixels == 0 || channels.is_empty() {
@@ -137,7 +156,7 @@ pub fn write_exr(
         (width as usize, height as usize),
         ex::LayerAttributes::default(),
         ex::Encoding {
-            compression: ex::Compression::ZIP16,
+            compression,
             blocks: ex::Blocks::ScanLines,
             line_order: ex::LineOrder::Increasing, // one order of blocks: the same bytes every time
         },
@@ -167,12 +186,16 @@ mod tests {
     }
 
     #[test]
-    fn the_same_picture_gives_the_same_bytes() {
+    fn the_same_picture_gives_the_same_bytes_and_either_compression_the_same_values() {
         let dir = tempfile::tempdir().unwrap();
         let (a, b) = (dir.path().join("a.exr"), dir.path().join("b.exr"));
         let values: Vec<f32> = (0..64 * 200).map(|i| (i % 97) as f32).collect();
         write_exr(&a, 64, 200, &[("Z", &values)]).unwrap();
         write_exr(&b, 64, 200, &[("Z", &values)]).unwrap();
-        assert_eq!(std::fs::read(a).unwrap(), std::fs::read(b).unwrap());
+        assert_eq!(std::fs::read(&a).unwrap(), std::fs::read(b).unwrap());
+        let zipped = read_exr(&a, &[&["Z"]], &Limits::default()).unwrap();
+        write_exr_quickly(&a, 64, 200, &[("Z", &values)]).unwrap();
+        assert_eq!(read_exr(&a, &[&["Z"]], &Limits::default()).unwrap(), zipped);
+        assert_eq!(zipped.image.data, values);
     }
 }

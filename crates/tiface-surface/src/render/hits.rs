@@ -1,6 +1,7 @@
 //! Points of a mesh that rays met, on their way to colors of pixels.
 
 use glam::Vec3;
+use std::ops::Range;
 use tiface_base::geom::Hit;
 
 /// The hits of rays, for the color function. All `[n]`.
@@ -19,6 +20,22 @@ pub struct RayHits {
 }
 
 impl RayHits {
+    /// Returns the hits of each ray.
+    pub(super) fn rays(&self) -> impl Iterator<Item = Range<usize>> {
+        let mut end = 0;
+        let of_one_ray = |a: usize, b: usize| {
+            self.pixels[a].0 == self.pixels[b].0 && self.directions[a] == self.directions[b]
+        };
+        std::iter::from_fn(move || {
+            let begin = end;
+            end += 1;
+            while end < self.pixels.len() && of_one_ray(begin, end) {
+                end += 1;
+            }
+            (begin < self.pixels.len()).then_some(begin..end)
+        })
+    }
+
     /// Adds the colors of all hits to their pixels, and forgets the hits.
     pub(super) fn shade(&mut self, rgba: &mut [[f32; 4]], color: &impl Fn(&RayHits) -> Vec<[f32; 3]>) {
         self.shade_each(&mut [rgba], &|hits: &RayHits| vec![color(hits)]);

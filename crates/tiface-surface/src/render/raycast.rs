@@ -15,6 +15,9 @@ use tiface_base::geom::{Bvh, Camera, Hit, Mesh, Ray, ShellCaster, Similarity};
 /// batches.
 const BATCH: usize = 8192;
 
+/// Columns of a band that are rendered together.
+const TILE: usize = 16;
+
 /// Depth change over one pixel, in pixel footprints, from which on it is an edge: tan 84°.
 const JUMP: f32 = 10.0;
 
@@ -131,7 +134,12 @@ impl Raycaster<'_> {
         let n = self.options.samples.max(1) as usize;
         let mut queue = RayHits::default();
         let mut found = Vec::with_capacity(4 * n * n);
-        for i in 0..depth.len() {
+        // neighbors meet the same boxes and triangles
+        let rows = depth.len() / w;
+        let columns = (0..w).step_by(TILE).map(|left| left..w.min(left + TILE));
+        let pixels =
+            columns.flat_map(|tile| (0..rows).flat_map(move |y| tile.clone().map(move |x| y * w + x)));
+        for i in pixels {
             let (x, y) = ((i % w) as f32, (top + i / w) as f32);
             let center = self.cast(x + 0.5, y + 0.5);
             if let Some((ray, Some(hit))) = &center {

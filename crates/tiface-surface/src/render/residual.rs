@@ -122,16 +122,21 @@ impl Residuals {
         Some(Residuals { views, reach, leaves_out_own })
     }
 
-    /// Adds residuals to the sRGB-coded `colors` of hits.
+    /// Adds residuals to the sRGB-coded `colors` of hits. The hits of a ray, which lie close
+    /// together on the mesh, get what the heaviest of them has.
     pub fn add(&self, hits: &RayHits, camera: &Camera, colors: &mut [[f32; 3]]) {
         let counts = |view: &&ResidualView| {
             !self.leaves_out_own || !is_same_position(view.camera.position, camera.position)
         };
         let views: Vec<&ResidualView> = self.views.iter().filter(counts).collect();
         let views: Vec<ViewBlock> = views.chunks(LANES).map(ViewBlock::new).collect();
-        for (i, color) in colors.iter_mut().enumerate() {
+        for ray in hits.rays() {
+            let heavier = |a: &usize, b: &usize| hits.pixels[*a].1.total_cmp(&hits.pixels[*b].1);
+            let Some(i) = ray.clone().max_by(heavier) else { continue };
             let change = self.at(&views, hits.points[i], hits.normals[i], hits.directions[i]);
-            *color = (Vec3::from(*color) + change).clamp(Vec3::ZERO, Vec3::ONE).to_array();
+            for color in &mut colors[ray] {
+                *color = (Vec3::from(*color) + change).clamp(Vec3::ZERO, Vec3::ONE).to_array();
+            }
         }
     }
 
@@ -404,6 +409,35 @@ mod tests {
         // along a camera path it does, so that no frame differs from its neighbors
         let residuals = Residuals { leaves_out_own: false, ..residuals };
         assert!(view(&residuals, &mesh, &camera(0.0)).pixel(30, 30)[0] > GRAY[0] + 0.1);
+    }
+
+    #[test]
+    fn the_hits_of_a_ray_get_what_the_heaviest_has() {
+        let (mesh, cameras) = (square(0.0, 3.0), [camera(-0.4), camera(0.4)]);
+        let photos = cameras.each_ref().map(|c| photo(c, patch));
+        let residuals = residuals(&mesh, &cameras, &photos, None).unwrap();
+        let changes = |hits: &[(Vec3, usize, f32)], directions: &[Vec3]| {
+            let hits = RayHits {
+                points: hits.iter().map(|hit| hit.0).collect(),
+                normals: vec![Vec3::Z; hits.len()],
+                directions: directions.to_vec(),
+                hits: Vec::new(),
+                pixels: hits.iter().map(|hit| (hit.1, hit.2)).collect(),
+            };
+            let mut colors = gray(&hits);
+            residuals.add(&hits, &camera(0.0), &mut colors);
+            colors
+        };
+        let (within, beyond) = (Vec3::ZERO, Vec3::new(1.5, 0.0, 0.0));
+        let (down, aside) = (-Vec3::Z, Vec3::new(0.01, 0.0, -1.0).normalize());
+        let [bright, plain] = [within, beyond].map(|point| changes(&[(point, 7, 1.0)], &[down])[0]);
+        assert!(bright[0] > plain[0] + 0.1);
+        let (heavy, light) = ((within, 7, 0.6), (beyond, 7, 0.4));
+        assert_eq!(changes(&[light, heavy], &[down, down]), [bright, bright]);
+        // rays differ in pixel or direction
+        assert_eq!(changes(&[light, (within, 8, 0.6)], &[down, down]), [plain, bright]);
+        let both = changes(&[light, heavy, light], &[down, aside, aside]);
+        assert!(both[0] == plain && both[1] == both[2] && both[1][0] > plain[0] + 0.1);
     }
 
     #[test]
