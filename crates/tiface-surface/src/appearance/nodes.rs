@@ -5,23 +5,22 @@ use rayon::prelude::*;
 use tiface_base::geom::{Atlas, Hit, Mesh, bilinear_taps};
 use tiface_base::image::Image;
 
-/// Returns items by the group that each is in, in their order: the start of each group, and all
-/// groups in one list.
-pub(super) fn grouped<T: Copy>(
+/// Puts items into groups, in their order: `put` gets each with its place in the list of all groups.
+/// Returns where each group begins, and the end of the last.
+pub(super) fn grouped<T>(
     groups: usize,
     items: impl Iterator<Item = (u32, T)> + Clone,
-    none: T,
-) -> (Vec<u32>, Vec<T>) {
+    mut put: impl FnMut(usize, T),
+) -> Vec<u32> {
     let mut start = vec![0u32; groups + 1];
     items.clone().for_each(|(group, _)| start[group as usize + 1] += 1);
     (0..groups).for_each(|i| start[i + 1] += start[i]);
     let mut next = start.clone();
-    let mut all = vec![none; start[groups] as usize];
     for (group, item) in items {
-        all[next[group as usize] as usize] = item;
+        put(next[group as usize] as usize, item);
         next[group as usize] += 1;
     }
-    (start, all)
+    start
 }
 
 /// Points of a surface that carry unknowns, between which a surface interpolates.
@@ -94,7 +93,8 @@ impl Nodes {
 
     fn linked(place: NodeLayout, count: usize, edges: &[[u32; 2]]) -> Nodes {
         let both = edges.iter().flat_map(|&[a, b]| [(a, b), (b, a)]);
-        let (near_start, near) = grouped(count, both, 0);
+        let mut near = vec![0; 2 * edges.len()];
+        let near_start = grouped(count, both, |at, node| near[at] = node);
         Nodes { place, count, near_start, near }
     }
 

@@ -27,8 +27,29 @@ pub struct Row {
     hits: Range<u32>,
 }
 
-/// What a ray meets, and its share in the pixel.
-type Met = (Hit, f32);
+/// What a ray meets, in little memory: there are tens of them a pixel.
+#[derive(Clone, Copy)]
+struct Met {
+    triangle: u32,
+    /// Weights of the triangle's second and third vertex, rounded down to [`STEPS`].
+    weights: [u16; 2],
+    /// Its share in the pixel.
+    share: f32,
+}
+
+/// Steps of a weight from 0 to 1.
+const STEPS: f32 = 65535.0;
+
+impl Met {
+    fn new(hit: &Hit, share: f32) -> Met {
+        Met { triangle: hit.triangle, weights: [hit.u, hit.v].map(|w| (w * STEPS) as u16), share }
+    }
+
+    fn hit(&self) -> Hit {
+        let [u, v] = self.weights.map(|w| f32::from(w) / STEPS);
+        Hit { t: 0.0, triangle: self.triangle, u, v }
+    }
+}
 
 /// A mesh, and the translucent layers around it, as rays meet them.
 pub struct RayTarget<'a> {
@@ -100,38 +121,42 @@ impl Rows {
 
     /// Returns the nodes under all rows, and their weights.
     pub fn matrix(&self, nodes: &Nodes) -> Matrix {
-        let parts: Vec<(Vec<u32>, Vec<(u32, f32)>)> = self
+        let parts: Vec<(Vec<u32>, Shares)> = self
             .par_chunks(1 << 14)
             .map(|rows| {
-                let (mut counts, mut entries) = (Vec::with_capacity(rows.len()), Vec::new());
+                let (mut counts, mut shares) = (Vec::with_capacity(rows.len()), Shares::default());
                 let mut row: Vec<(u32, f32)> = Vec::new();
                 for Row { hits, .. } in rows {
                     row.clear();
-                    for (hit, share) in &self.met[hits.start as usize..hits.end as usize] {
-                        nodes.under(hit, |node, w| match row.iter_mut().find(|e| e.0 == node) {
-                            Some(e) => e.1 += w * share,
-                            None => row.push((node, w * share)),
+                    for met in &self.met[hits.start as usize..hits.end as usize] {
+                        nodes.under(&met.hit(), |node, w| match row.iter_mut().find(|e| e.0 == node) {
+                            Some(e) => e.1 += w * met.share,
+                            None => row.push((node, w * met.share)),
                         });
                     }
                     counts.push(row.len() as u32);
-                    entries.extend_from_slice(&row);
+                    shares.of.extend(row.iter().map(|e| e.0));
+                    shares.share.extend(row.iter().map(|e| (e.1 * STEPS + 0.5) as u16));
                 }
-                (counts, entries)
+                (counts, shares)
             })
             .collect();
-        let mut start = vec![0u32];
-        let mut entries: Vec<(u32, f32)> = Vec::with_capacity(parts.iter().map(|p| p.1.len()).sum());
+        let len = parts.iter().map(|part| part.1.of.len()).sum();
+        let mut rows = Shares { start: vec![0], of: Vec::with_capacity(len), share: Vec::with_capacity(len) };
         for (counts, part) in parts {
             for n in counts {
-                start.push(start[start.len() - 1] + n);
+                rows.start.push(rows.start[rows.start.len() - 1] + n);
             }
-            entries.extend(part);
+            rows.of.extend(part.of);
+            rows.share.extend(part.share);
         }
-        let row = |p: usize| start[p] as usize..start[p + 1] as usize;
+        let mut columns = Shares { start: Vec::new(), of: vec![0; len], share: vec![0; len] };
         let by_node =
-            (0..self.len()).flat_map(|p| entries[row(p)].iter().map(move |e| (e.0, (p as u32, e.1))));
-        let (column_start, column_entries) = grouped(nodes.len(), by_node, (0, 0.0));
-        Matrix { start, entries, column_start, column_entries }
+            (0..self.len()).flat_map(|p| rows.stored(p).map(move |(node, share)| (node, (p as u32, share))));
+        columns.start = grouped(nodes.len(), by_node, |at, (row, share)| {
+            (columns.of[at], columns.share[at]) = (row, share);
+        });
+        Matrix { rows, columns }
     }
 }
 
@@ -163,11 +188,11 @@ impl Row {
             let mut left = share;
             if let Some(layers) = layers {
                 layers.cast(&ray, hit.t, |_, hit, alpha| {
-                    met.push((hit, left * alpha));
+                    met.push(Met::new(&hit, left * alpha));
                     left *= 1.0 - alpha;
                 });
             }
-            met.push((hit, left));
+            met.push(Met::new(&hit, left));
         }
         let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
         Some(Row {
@@ -182,26 +207,55 @@ impl Row {
 
 /// Which nodes a row shows and which rows show a node, with the node's share of the row.
 pub struct Matrix {
+    rows: Shares,
+    columns: Shares,
+}
+
+/// For each row its nodes, or for each node its rows, with the node's share of the row: it takes
+/// most of the memory of a fit, and of its time.
+#[derive(Default)]
+struct Shares {
+    /// Where the entries of each begin; one more than there are.
     start: Vec<u32>,
-    entries: Vec<(u32, f32)>,
-    column_start: Vec<u32>,
-    column_entries: Vec<(u32, f32)>,
+    /// Node or row of each entry.
+    of: Vec<u32>,
+    /// Share of each entry, in [`STEPS`].
+    share: Vec<u16>,
+}
+
+impl Shares {
+    fn range(&self, i: usize) -> Range<usize> {
+        self.start[i] as usize..self.start[i + 1] as usize
+    }
+
+    #[inline(always)]
+    fn stored(&self, i: usize) -> impl Iterator<Item = (u32, u16)> + Clone {
+        let range = self.range(i);
+        self.of[range.clone()].iter().copied().zip(self.share[range].iter().copied())
+    }
+
+    #[inline(always)]
+    fn entries(&self, i: usize) -> impl Iterator<Item = (u32, f32)> {
+        self.stored(i).map(|(of, share)| (of, f32::from(share) * (1.0 / STEPS)))
+    }
 }
 
 impl Matrix {
     /// Returns the nodes of a row; their shares sum to 1.
-    pub fn row(&self, row: usize) -> &[(u32, f32)] {
-        &self.entries[self.start[row] as usize..self.start[row + 1] as usize]
+    #[inline(always)]
+    pub fn row(&self, row: usize) -> impl Iterator<Item = (u32, f32)> {
+        self.rows.entries(row)
     }
 
     /// Returns the rows of a node.
-    pub fn column(&self, node: usize) -> &[(u32, f32)] {
-        &self.column_entries[self.column_start[node] as usize..self.column_start[node + 1] as usize]
+    #[inline(always)]
+    pub fn column(&self, node: usize) -> impl Iterator<Item = (u32, f32)> {
+        self.columns.entries(node)
     }
 
     /// Returns the share of the nodes that some row shows.
     pub fn seen(&self) -> f64 {
-        let nodes = self.column_start.len() - 1;
-        (0..nodes).filter(|&n| !self.column(n).is_empty()).count() as f64 / nodes.max(1) as f64
+        let nodes = self.columns.start.len() - 1;
+        (0..nodes).filter(|&n| !self.columns.range(n).is_empty()).count() as f64 / nodes.max(1) as f64
     }
 }

@@ -71,7 +71,7 @@ impl System<'_> {
         out.par_chunks_mut(count * count).enumerate().with_min_len(256).for_each(|(node, out)| {
             // one direction a photograph: rows are sorted by them
             let mut seen: Vec<(u32, Vec3)> = Vec::new();
-            for row in self.matrix.column(node).iter().map(|&(p, _)| &self.rows[p as usize]) {
+            for row in self.matrix.column(node).map(|(p, _)| &self.rows[p as usize]) {
                 if keep(row.view) && seen.last().is_none_or(|last| last.0 != row.view) {
                     seen.push((row.view, row.direction));
                 }
@@ -244,7 +244,7 @@ impl Normal<'_> {
         let mut out = vec![0f64; self.system.nodes.len() * n * n];
         out.par_chunks_mut(n * n).enumerate().with_min_len(256).for_each(|(node, block)| {
             let mut sums = [[0f32; COEFFICIENTS_OF_DEGREE_2]; COEFFICIENTS_OF_DEGREE_2];
-            for &(p, w) in self.system.matrix.column(node) {
+            for (p, w) in self.system.matrix.column(node) {
                 let (y, w) = (self.y(p as usize), w * w * self.weight[p as usize]);
                 for (sums, a) in sums.iter_mut().zip(y) {
                     sums.iter_mut().zip(y).for_each(|(sum, b)| *sum += w * a * b);
@@ -335,7 +335,7 @@ fn products_of<const COUNT: usize>(t: &mut Products) {
     let x = t.x.as_chunks::<COUNT>().0;
     for (row, out) in (t.first..).zip(t.out.iter_mut()) {
         let mut sums = [[0f32; 4]; COUNT];
-        for &(node, w) in t.matrix.row(row) {
+        for (node, w) in t.matrix.row(row) {
             for (sum, x) in sums.iter_mut().zip(&x[node as usize]) {
                 (0..4).for_each(|c| sum[c] += w * x[c]);
             }
@@ -374,7 +374,7 @@ fn gather_of<const COUNT: usize>(t: &mut Gather) {
     let Normal { system, harmonics, .. } = t.normal;
     for (node, out) in (t.first..).zip(t.out.chunks_exact_mut(3 * COUNT)) {
         let mut sums = [[0f32; 4]; COUNT];
-        for &(p, w) in system.matrix.column(node) {
+        for (p, w) in system.matrix.column(node) {
             let value = t.values[p as usize].map(|v| w * v);
             let y: &[f32] = harmonics.get(p as usize).map_or(&[1.0], |y| y);
             for (sum, y) in sums.iter_mut().zip(y) {
