@@ -88,32 +88,40 @@ pub fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES], (index, frac
             low[a][i] = unsafe { above.min(1e9).to_int_unchecked::<i32>() } as u32;
         }
     }
+    let r = level.resolution;
+    // the part of an axis in the number of an entry, for the lower and the upper corner
+    let factors = if level.is_hashed() { PRIMES } else { [1, r, r.wrapping_mul(r)] };
+    let mut part = [[[0u32; LANES]; 2]; 3];
+    for a in 0..3 {
+        for i in 0..LANES {
+            part[a][0][i] = low[a][i].wrapping_mul(factors[a]);
+            part[a][1][i] = part[a][0][i].wrapping_add(factors[a]);
+        }
+    }
+    let corner = |k: usize| [&part[0][k & 1], &part[1][k >> 1 & 1], &part[2][k >> 2]];
     if level.is_hashed() {
         // hashed tables are powers of two, so `mod entries` is a mask
         let mask = level.entries - 1;
-        let at = |a: usize, i: usize, up: usize| low[a][i].wrapping_add(up as u32).wrapping_mul(PRIMES[a]);
         for k in 0..8 {
+            let [x, y, z] = corner(k);
             for i in 0..LANES {
-                index[k][i] = (at(0, i, k & 1) ^ at(1, i, k >> 1 & 1) ^ at(2, i, k >> 2)) & mask;
+                index[k][i] = (x[i] ^ y[i] ^ z[i]) & mask;
             }
         }
     } else {
-        let r = level.resolution;
+        let mut last = [0; LANES];
         for k in 0..8 {
+            let [x, y, z] = corner(k);
             for i in 0..LANES {
-                let at = |a: usize| low[a][i].wrapping_add((k >> a & 1) as u32);
-                let entry = at(0).wrapping_add(r.wrapping_mul(at(1).wrapping_add(r.wrapping_mul(at(2)))));
+                let entry = x[i].wrapping_add(y[i]).wrapping_add(z[i]);
                 // because of the half-cell stagger, cell + 1 can equal the resolution at the
                 // border, and wraps
                 index[k][i] = entry.min(entry.wrapping_sub(level.entries));
+                last[i] = last[i].max(index[k][i]);
             }
         }
         // farther outside of the box it wraps more than once
-        let mut last = 0;
-        for &i in index.as_flattened() {
-            last = last.max(i);
-        }
-        if last >= level.entries {
+        if last.iter().any(|last| *last >= level.entries) {
             index.as_flattened_mut().iter_mut().for_each(|i| *i %= level.entries);
         }
     }
@@ -138,6 +146,16 @@ fn fetch_cells<const F: bool>(level: &Level, table: &[[f32; 2]], x01: &[[f32; 3]
         // callers' tables.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(table.as_ptr().add(i as usize).cast()) };
     }
+}
+
+/// Returns a component of each sample.
+#[inline(always)]
+fn lane<const N: usize>(x: &[[f32; N]; LANES], c: usize) -> Lanes {
+    let mut out = [0f32; LANES];
+    for i in 0..LANES {
+        out[i] = x[i][c];
+    }
+    out
 }
 
 /// `a + t (b − a)` for each sample.
@@ -176,49 +194,53 @@ fn gather_body<const F: bool>(
     // of a block and of the next one, in turn
     let mut found = [Cells::default(); 2];
     fetch_cells::<F>(level, table, x01, &mut found[0]);
-    for (b, value) in value.chunks_mut(LANES).enumerate() {
+    let count = value.len();
+    let (blocks, rest) = value.as_chunks_mut::<LANES>();
+    let mut last = [[0f32; 2]; LANES];
+    for b in 0..count.div_ceil(LANES) {
         let next = x01.get((b + 1) * LANES..).unwrap_or_default();
         fetch_cells::<F>(level, table, next, &mut found[(b + 1) % 2]);
         let (index, [fx, fy, fz]) = &found[b % 2];
         let jacobian = jacobian.as_mut().map_or(&mut unused, |jacobian| &mut jacobian[b]);
-        let mut corner = [[[0f32; 2]; LANES]; 8];
+        // both features at all corners
+        let mut e = [[[0f32; LANES]; 8]; 2];
         for k in 0..8 {
             for i in 0..LANES {
                 // SAFETY: `cells` gives indices below `level.entries`, asserted above.
-                corner[k][i] = unsafe { *table.get_unchecked(index[k][i] as usize) };
+                let entry = unsafe { *table.get_unchecked(index[k][i] as usize) };
+                (e[0][k][i], e[1][k][i]) = (entry[0], entry[1]);
             }
         }
-        let mut out = [[0f32; 2]; LANES];
-        for c in 0..2 {
-            let mut e = [[0f32; LANES]; 8];
-            for k in 0..8 {
-                for i in 0..LANES {
-                    e[k][i] = corner[k][i][c];
-                }
-            }
-            // along x at the four edges, along y at the two faces, then along z
-            let edge: [Lanes; 4] = std::array::from_fn(|k| mix::<F>(&e[2 * k], &e[2 * k + 1], fx));
-            let face: [Lanes; 2] = std::array::from_fn(|k| mix::<F>(&edge[2 * k], &edge[2 * k + 1], fy));
-            let sum = mix::<F>(&face[0], &face[1], fz);
-            for i in 0..LANES {
-                out[i][c] = sum[i];
-            }
-            let dx: [Lanes; 4] = std::array::from_fn(|k| minus(&e[2 * k + 1], &e[2 * k]));
-            let dx: [Lanes; 2] = std::array::from_fn(|k| mix::<F>(&dx[2 * k], &dx[2 * k + 1], fy));
-            let dy: [Lanes; 2] = std::array::from_fn(|k| minus(&edge[2 * k + 1], &edge[2 * k]));
-            let d = [mix::<F>(&dx[0], &dx[1], fz), mix::<F>(&dy[0], &dy[1], fz), minus(&face[1], &face[0])];
-            for a in 0..3 {
-                for i in 0..LANES {
-                    jacobian[3 * c + a][i] = d[a][i] * slope;
-                }
-            }
-        }
-        // a copy of a length that is not known would be a call
-        match value.first_chunk_mut() {
-            Some(value) => *value = out,
-            None => value.copy_from_slice(&out[..value.len()]),
+        let ([first, second], fraction) = (&e, [fx, fy, fz]);
+        let (first, [x0, y0, z0]) = interpolated::<F>(first, fraction, slope);
+        let (second, [x1, y1, z1]) = interpolated::<F>(second, fraction, slope);
+        *jacobian = [x0, y0, z0, x1, y1, z1];
+        let value = blocks.get_mut(b).unwrap_or(&mut last);
+        for i in 0..LANES {
+            value[i] = [first[i], second[i]];
         }
     }
+    let left = rest.len();
+    rest.copy_from_slice(&last[..left]);
+}
+
+/// Returns a feature interpolated between the corners `e` of cells, and its derivatives, which have
+/// the factor `slope`.
+#[inline(always)]
+fn interpolated<const F: bool>(e: &[Lanes; 8], [fx, fy, fz]: [&Lanes; 3], slope: f32) -> (Lanes, [Lanes; 3]) {
+    // along x at the four edges, along y at the two faces, then along z
+    let edge: [Lanes; 4] = std::array::from_fn(|k| mix::<F>(&e[2 * k], &e[2 * k + 1], fx));
+    let face: [Lanes; 2] = std::array::from_fn(|k| mix::<F>(&edge[2 * k], &edge[2 * k + 1], fy));
+    let dx: [Lanes; 4] = std::array::from_fn(|k| minus(&e[2 * k + 1], &e[2 * k]));
+    let dx: [Lanes; 2] = std::array::from_fn(|k| mix::<F>(&dx[2 * k], &dx[2 * k + 1], fy));
+    let dy: [Lanes; 2] = std::array::from_fn(|k| minus(&edge[2 * k + 1], &edge[2 * k]));
+    let mut d = [mix::<F>(&dx[0], &dx[1], fz), mix::<F>(&dy[0], &dy[1], fz), minus(&face[1], &face[0])];
+    for a in 0..3 {
+        for i in 0..LANES {
+            d[a][i] *= slope;
+        }
+    }
+    (mix::<F>(&face[0], &face[1], fz), d)
 }
 
 dispatch! {
@@ -289,19 +311,40 @@ fn scatter_body<const F: bool>(
         let (count, b) = (span.len(), first / LANES);
         fetch_cells::<F>(level, gradient, &x01[span.end..], &mut found[(b + 1) % 2]);
         let (index, f) = &found[b % 2];
-        let normal = block(&g_normal[span.clone()]);
-        let (gv, qv) = (block(&g_value[span.clone()]), block(&q[span]));
+        let (normal, gv) = (block(&g_normal[span.clone()]), block(&g_value[span.clone()]));
+        let qv = block(&q[span]);
+        let (gv, qv) = ([lane(&gv, 0), lane(&gv, 1)], [lane(&qv, 0), lane(&qv, 1)]);
+        // of the lower and of the upper corner along each axis: its share, and the derivative of
+        // that along the gradient
+        let mut share = [[[0f32; LANES]; 2]; 3];
+        let mut turn = [[[0f32; LANES]; 2]; 3];
+        for a in 0..3 {
+            let normal = lane(&normal, a);
+            for i in 0..LANES {
+                share[a][0][i] = 1.0 - f[a][i];
+                share[a][1][i] = f[a][i];
+                turn[a][0][i] = normal[i] * -slope;
+                turn[a][1][i] = normal[i] * slope;
+            }
+        }
         let mut add = [[[0f32; 2]; LANES]; 8];
         for k in 0..8 {
-            let up = |a: usize| (k >> a & 1) == 1;
+            let up = |a: usize| k >> a & 1;
+            let w: [&Lanes; 3] = std::array::from_fn(|a| &share[a][up(a)]);
+            let n: [&Lanes; 3] = std::array::from_fn(|a| &turn[a][up(a)]);
+            let mut sum = [[0f32; LANES]; 2];
             for i in 0..LANES {
-                let w: [f32; 3] = std::array::from_fn(|a| if up(a) { f[a][i] } else { 1.0 - f[a][i] });
-                let n: [f32; 3] = std::array::from_fn(|a| normal[i][a] * if up(a) { slope } else { -slope });
-                let weight = w[0] * w[1] * w[2];
-                let d = fma::<F>(n[0] * w[1], w[2], w[0] * fma::<F>(n[1], w[2], n[2] * w[1]));
-                for c in 0..2 {
-                    add[k][i][c] = fma::<F>(gv[i][c], weight, qv[i][c] * d);
-                }
+                let weight = w[0][i] * w[1][i] * w[2][i];
+                let d = fma::<F>(
+                    n[0][i] * w[1][i],
+                    w[2][i],
+                    w[0][i] * fma::<F>(n[1][i], w[2][i], n[2][i] * w[1][i]),
+                );
+                sum[0][i] = fma::<F>(gv[0][i], weight, qv[0][i] * d);
+                sum[1][i] = fma::<F>(gv[1][i], weight, qv[1][i] * d);
+            }
+            for i in 0..LANES {
+                add[k][i] = [sum[0][i], sum[1][i]];
             }
         }
         for i in 0..count {

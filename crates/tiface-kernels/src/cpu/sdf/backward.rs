@@ -2,7 +2,7 @@
 
 use super::color::backward_rows;
 use super::{Activations, CHUNK, WIDTH};
-use crate::cpu::hash::{self, JacobianBlock, LANES};
+use crate::cpu::hash::{self, JacobianBlock, LANES, Lanes};
 use crate::cpu::matrix::add_to;
 use crate::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, SOFTNESS, TILE, Weights};
 use crate::cpu::neus::MIN_GRADIENT_NORM;
@@ -91,17 +91,19 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
         }
         for l in 0..a.shape.active {
             let jacobian = &jacobian[l * blocks + base / LANES..][..rows.div_ceil(LANES)];
-            for (b, j) in jacobian.iter().enumerate() {
+            let rows = g_q.chunks_exact_mut(LANES * kp);
+            for ((b, j), rows) in jacobian.iter().enumerate().zip(rows) {
+                let n: [&Lanes; 3] = std::array::from_fn(|k| &normal[k].as_chunks().0[b]);
                 let mut pair = [[0f32; LANES]; 2];
                 for c in 0..2 {
+                    let j = [&j[3 * c], &j[3 * c + 1], &j[3 * c + 2]];
                     for i in 0..LANES {
-                        let n: [f32; 3] = std::array::from_fn(|k| normal[k][b * LANES + i]);
-                        let j = &j[3 * c..];
-                        pair[c][i] = fma::<F>(j[0][i], n[0], fma::<F>(j[1][i], n[1], j[2][i] * n[2]));
+                        pair[c][i] =
+                            fma::<F>(j[0][i], n[0][i], fma::<F>(j[1][i], n[1][i], j[2][i] * n[2][i]));
                     }
                 }
-                for i in 0..LANES {
-                    g_q[(b * LANES + i) * kp + 2 * l..][..2].copy_from_slice(&[pair[0][i], pair[1][i]]);
+                for (i, row) in rows.chunks_exact_mut(kp).enumerate() {
+                    (row[2 * l], row[2 * l + 1]) = (pair[0][i], pair[1][i]);
                 }
             }
         }
@@ -122,7 +124,8 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
         }
         let sums: (&mut [[f32; HIDDEN]], &mut [[f32; HIDDEN]]) =
             (g_w2.as_chunks_mut().0, g_b1.as_chunks_mut().0);
-        let (g_row, g_bias) = (&mut sums.0[0], &mut sums.1[0]);
+        // copies, since the loop is compiled without vectors where its sums could lie in each other
+        let (mut g_row, mut g_bias) = (sums.0[0], sums.1[0]);
         let given = s.as_chunks::<HIDDEN>().0.iter().zip(g_a.as_chunks::<HIDDEN>().0);
         for ((s, g_a), g_z) in given.zip(g_z.as_chunks_mut::<HIDDEN>().0).take(rows) {
             for j in 0..HIDDEN {
@@ -131,17 +134,22 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
                 g_bias[j] += g_z[j];
             }
         }
+        (sums.0[0], sums.1[0]) = (g_row, g_bias);
         g_z[rows * HIDDEN..].fill(0.0);
         gemm((HIDDEN, kp, TILE), &weighted, (1, HIDDEN), &g_q, kp, g_w1, kp, true);
         gemm((HIDDEN, kp, TILE), &g_z, (1, HIDDEN), u, kp, g_w1, kp, true);
         let wide = (TILE, features_padded, HIDDEN);
         gemm(wide, &g_z, (HIDDEN, 1), &w.w1.m, kp, &mut g_u, kp, false);
         for (l, g_value) in t.g_value.iter_mut().enumerate() {
-            for (r, g) in g_value[tile * TILE..][..rows].iter_mut().enumerate() {
-                let of_layer = &g_u[r * kp + 2 * l..][..2];
-                let skip =
-                    if w.layout.color_skip { &g_c0[r * ci + COLOR_INPUTS + 2 * l..][..2] } else { &[0.0; 2] };
-                *g = [of_layer[0] + skip[0], of_layer[1] + skip[1]];
+            let g_value = &mut g_value[tile * TILE..][..rows];
+            for (g, of_layer) in g_value.iter_mut().zip(g_u.chunks_exact(kp)) {
+                *g = [of_layer[2 * l], of_layer[2 * l + 1]];
+            }
+            if w.layout.color_skip {
+                for (g, skipped) in g_value.iter_mut().zip(g_c0.chunks_exact(ci)) {
+                    let skipped = &skipped[COLOR_INPUTS..];
+                    *g = [g[0] + skipped[2 * l], g[1] + skipped[2 * l + 1]];
+                }
             }
         }
     }
