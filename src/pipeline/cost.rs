@@ -80,7 +80,7 @@ mod kept {
     pub const FLOAT_TEXEL: f64 = 12.0;
     /// A pixel of a view with its depth, and of a float one.
     pub const VIEW_PIXEL: f64 = 3.0;
-    pub const FLOAT_PIXEL: f64 = 14.0;
+    pub const FLOAT_PIXEL: f64 = 17.0;
     /// A pixel of a blend.
     pub const BLEND_PIXEL: f64 = 2.0;
     /// The report.
@@ -253,7 +253,7 @@ impl<'a> Workload<'a> {
             _ => 2.5e-6,
         };
         let residuals = if config.shows_residuals(methods) { self.all } else { 0.0 };
-        let cpu_s = 0.1 + self.shown * methods.iter().map(pixel).sum::<f64>() + 1.6e-6 * residuals;
+        let cpu_s = 0.1 + self.shown * methods.iter().map(pixel).sum::<f64>() + 1e-6 * residuals;
         (cpu_s, mib::VIEW_PIXEL * self.each + self.renderers(methods, residuals))
     }
 

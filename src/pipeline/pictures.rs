@@ -110,7 +110,7 @@ pub(super) fn write_float(folder: &Path, name: &str, view: &RenderedView) -> Res
     let color = [0, 1, 2, 3].map(|k| view.color.channel(k));
     let all = CODED.iter().copied().zip(color.iter().chain([&view.depth.data]).map(Vec::as_slice));
     let channels: Vec<(&str, &[f32])> = all.filter(|(_, values)| !values.is_empty()).collect();
-    io::write_exr_quickly(&file, view.color.width, view.color.height, &channels)
+    io::write_exr_rle(&file, view.color.width, view.color.height, &channels)
 }
 
 /// Reads the color (RGBA over black) that [`write_float`] wrote, bit by bit.

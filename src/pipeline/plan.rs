@@ -298,7 +298,7 @@ impl Session<'_> {
                 surface + mesh.texels() * (6 * mesh.pictures() + 3 + if mesh.exr { 12 } else { 0 })
             }
             Stage::Render => {
-                let each = if render.float { 12 + 10 } else { 12 };
+                let each = if render.float { 12 + 12 } else { 12 };
                 self.pixels() * each * render.method.len().max(1) as u64 / 2
             }
             Stage::Ensemble => self.pixels() * 4,

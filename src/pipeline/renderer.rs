@@ -95,7 +95,9 @@ impl<'a> VisibleHead<'a> {
     /// Rasterizes what ray casting shows of the head without residuals, with depth in the mesh's
     /// units and without normals.
     fn rasterized(&self, camera: &Camera) -> RenderedView {
-        let options = RasterOptions { normals: false, bare_hits: true, ..RasterOptions::default() };
+        // colors of heads without any are those of their normals
+        let bare_hits = self.texture.is_some() || !self.head.mesh.colors.is_empty();
+        let options = RasterOptions { normals: false, bare_hits, ..RasterOptions::default() };
         let colors = |hits: &RayHits| self.colors(&[Method::Raycast], hits, camera, 1).remove(0);
         raster(&self.head.mesh, self.layers.as_ref(), camera, &options, colors).view
     }
@@ -226,8 +228,6 @@ impl<'a> Renderer<'a> {
         let meshes =
             [self.extracted.as_ref().map(|(s, _)| &s.mesh), self.head.as_ref().map(|h| &h.head.mesh)];
         let Some(mesh) = meshes.into_iter().flatten().next() else { return Ok(None) };
-        // depth in the scene's units; colors are filtered over a pixel, whatever the number of rays
-        let options = RaycastOptions { samples: 1, ..RaycastOptions::default() };
         let mut residuals = Vec::new();
         // one photograph at a time: all of them with their views could fill the memory
         for (view, tiles) in learn::held_out_tiles(capture, config) {
@@ -236,10 +236,16 @@ impl<'a> Renderer<'a> {
             }
             let loaded = learn::training_view(view, &tiles, scene)?;
             let (camera, mask, valid) = (&loaded.camera, loaded.mask.as_ref(), loaded.valid.as_ref());
-            // pixels are compared by their centers, so rasterizing is as good
-            let view = match &self.head {
-                Some(head) if self.extracted.is_none() => Some(head.rasterized(camera)),
-                _ => self.cast(&[Method::Raycast], camera, &options)?.pop(),
+            let view = match self.head.as_ref().filter(|_| self.casts_at_head(Method::Raycast)) {
+                // only pixels count whose neighbors show the same surface: there a ray through the
+                // center sees the same, but for the edges of layers
+                Some(head) => Some(head.rasterized(camera)),
+                None => {
+                    // depth in the scene's units; colors are filtered over a pixel, whatever the
+                    // number of rays
+                    let options = RaycastOptions { samples: 1, ..RaycastOptions::default() };
+                    self.cast(&[Method::Raycast], camera, &options)?.pop()
+                }
             };
             if let Some(view) = view {
                 let source = ResidualSource { camera, photo: &loaded.photo, mask, valid, view };
@@ -418,6 +424,30 @@ pub(super) mod tests {
         let differs =
             |a: &RenderedView, b: &RenderedView| covered.iter().any(|&i| pixels(a)[i] != pixels(b)[i]);
         assert!(differs(plain, textured) && differs(plain, raycast) && differs(textured, raycast));
+    }
+
+    #[test]
+    fn inside_of_the_head_rasterized_views_show_what_rays_see() {
+        let meshes = Meshes::of_head(tetrahedron());
+        let scene = Scene { scene_from_world: Similarity::IDENTITY, aabb: Aabb::SCENE, hull: None };
+        let renderer = Renderer::new(&scene, &Red, &meshes, 1, &Quiet);
+        let camera = Camera::above(64, 64, 64.0, 4.0);
+        let cast = renderer.view(Method::Raycast, &camera).unwrap().unwrap();
+        let rasterized = renderer.head.as_ref().unwrap().rasterized(&camera);
+        let covered = |x: u32, y: u32| {
+            let around = (y - 1..=y + 1).flat_map(|y| (x - 1..=x + 1).map(move |x| (x, y)));
+            around.into_iter().all(|(x, y)| rasterized.color.pixel(x, y)[3] > 0.999)
+        };
+        let inner = (1..63).flat_map(|y| (1..63).map(move |x| (x, y))).filter(|&(x, y)| covered(x, y));
+        let mut count = 0;
+        for (x, y) in inner {
+            let (ours, theirs) = (rasterized.color.pixel(x, y), cast.color.pixel(x, y));
+            let error = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let depths = [&rasterized, &cast].map(|view| view.depth.pixel(x, y)[0]);
+            assert!(error < 1e-3 && (depths[0] - depths[1]).abs() < 1e-5, "{x} {y}: {error} {depths:?}");
+            count += 1;
+        }
+        assert!(count > 50, "{count}");
     }
 
     #[test]

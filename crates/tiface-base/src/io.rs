@@ -23,7 +23,7 @@ mod tensors;
 mod video;
 mod write;
 
-pub use self::exr::{ExrImage, read_exr, write_exr, write_exr_quickly};
+pub use self::exr::{ExrImage, read_exr, write_exr, write_exr_rle};
 pub use animation::{ANIMATIONS, Animation, Frames, write_animation};
 pub use folder::{
     any_file, append, clear_folder, create_folder, exists, file_size, file_sizes, files_below, free_bytes,

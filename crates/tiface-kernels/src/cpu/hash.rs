@@ -89,16 +89,16 @@ pub fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES], (index, frac
         }
     }
     let r = level.resolution;
-    // the part of an axis in the number of an entry, for the lower and the upper corner
+    // each axis's term in an entry's index, for the lower and the upper corner
     let factors = if level.is_hashed() { PRIMES } else { [1, r, r.wrapping_mul(r)] };
-    let mut part = [[[0u32; LANES]; 2]; 3];
+    let mut term = [[[0u32; LANES]; 2]; 3];
     for a in 0..3 {
         for i in 0..LANES {
-            part[a][0][i] = low[a][i].wrapping_mul(factors[a]);
-            part[a][1][i] = part[a][0][i].wrapping_add(factors[a]);
+            term[a][0][i] = low[a][i].wrapping_mul(factors[a]);
+            term[a][1][i] = term[a][0][i].wrapping_add(factors[a]);
         }
     }
-    let corner = |k: usize| [&part[0][k & 1], &part[1][k >> 1 & 1], &part[2][k >> 2]];
+    let corner = |k: usize| [&term[0][k & 1], &term[1][k >> 1 & 1], &term[2][k >> 2]];
     if level.is_hashed() {
         // hashed tables are powers of two, so `mod entries` is a mask
         let mask = level.entries - 1;
@@ -150,7 +150,7 @@ fn fetch_cells<const F: bool>(level: &Level, table: &[[f32; 2]], x01: &[[f32; 3]
 
 /// Returns a component of each sample.
 #[inline(always)]
-fn lane<const N: usize>(x: &[[f32; N]; LANES], c: usize) -> Lanes {
+fn component<const N: usize>(x: &[[f32; N]; LANES], c: usize) -> Lanes {
     let mut out = [0f32; LANES];
     for i in 0..LANES {
         out[i] = x[i][c];
@@ -200,9 +200,9 @@ fn gather_body<const F: bool>(
     for b in 0..count.div_ceil(LANES) {
         let next = x01.get((b + 1) * LANES..).unwrap_or_default();
         fetch_cells::<F>(level, table, next, &mut found[(b + 1) % 2]);
-        let (index, [fx, fy, fz]) = &found[b % 2];
+        let (index, fraction) = &found[b % 2];
         let jacobian = jacobian.as_mut().map_or(&mut unused, |jacobian| &mut jacobian[b]);
-        // both features at all corners
+        // [feature][corner][sample]
         let mut e = [[[0f32; LANES]; 8]; 2];
         for k in 0..8 {
             for i in 0..LANES {
@@ -211,23 +211,21 @@ fn gather_body<const F: bool>(
                 (e[0][k][i], e[1][k][i]) = (entry[0], entry[1]);
             }
         }
-        let ([first, second], fraction) = (&e, [fx, fy, fz]);
-        let (first, [x0, y0, z0]) = interpolated::<F>(first, fraction, slope);
-        let (second, [x1, y1, z1]) = interpolated::<F>(second, fraction, slope);
+        let (first, [x0, y0, z0]) = interpolated::<F>(&e[0], fraction, slope);
+        let (second, [x1, y1, z1]) = interpolated::<F>(&e[1], fraction, slope);
         *jacobian = [x0, y0, z0, x1, y1, z1];
         let value = blocks.get_mut(b).unwrap_or(&mut last);
         for i in 0..LANES {
             value[i] = [first[i], second[i]];
         }
     }
-    let left = rest.len();
-    rest.copy_from_slice(&last[..left]);
+    rest.copy_from_slice(&last[..rest.len()]);
 }
 
-/// Returns a feature interpolated between the corners `e` of cells, and its derivatives, which have
-/// the factor `slope`.
+/// Returns a feature interpolated between the corners `e` of cells, and its derivatives times
+/// `slope`.
 #[inline(always)]
-fn interpolated<const F: bool>(e: &[Lanes; 8], [fx, fy, fz]: [&Lanes; 3], slope: f32) -> (Lanes, [Lanes; 3]) {
+fn interpolated<const F: bool>(e: &[Lanes; 8], [fx, fy, fz]: &[Lanes; 3], slope: f32) -> (Lanes, [Lanes; 3]) {
     // along x at the four edges, along y at the two faces, then along z
     let edge: [Lanes; 4] = std::array::from_fn(|k| mix::<F>(&e[2 * k], &e[2 * k + 1], fx));
     let face: [Lanes; 2] = std::array::from_fn(|k| mix::<F>(&edge[2 * k], &edge[2 * k + 1], fy));
@@ -313,26 +311,26 @@ fn scatter_body<const F: bool>(
         let (index, f) = &found[b % 2];
         let (normal, gv) = (block(&g_normal[span.clone()]), block(&g_value[span.clone()]));
         let qv = block(&q[span]);
-        let (gv, qv) = ([lane(&gv, 0), lane(&gv, 1)], [lane(&qv, 0), lane(&qv, 1)]);
-        // of the lower and of the upper corner along each axis: its share, and the derivative of
-        // that along the gradient
+        let (gv, qv) = ([component(&gv, 0), component(&gv, 1)], [component(&qv, 0), component(&qv, 1)]);
+        // the share of the lower and of the upper corner along each axis, and its derivative along
+        // `g_normal`
         let mut share = [[[0f32; LANES]; 2]; 3];
-        let mut turn = [[[0f32; LANES]; 2]; 3];
+        let mut slope_along = [[[0f32; LANES]; 2]; 3];
         for a in 0..3 {
-            let normal = lane(&normal, a);
+            let normal = component(&normal, a);
             for i in 0..LANES {
                 share[a][0][i] = 1.0 - f[a][i];
                 share[a][1][i] = f[a][i];
-                turn[a][0][i] = normal[i] * -slope;
-                turn[a][1][i] = normal[i] * slope;
+                slope_along[a][0][i] = normal[i] * -slope;
+                slope_along[a][1][i] = normal[i] * slope;
             }
         }
         let mut add = [[[0f32; 2]; LANES]; 8];
         for k in 0..8 {
             let up = |a: usize| k >> a & 1;
             let w: [&Lanes; 3] = std::array::from_fn(|a| &share[a][up(a)]);
-            let n: [&Lanes; 3] = std::array::from_fn(|a| &turn[a][up(a)]);
-            let mut sum = [[0f32; LANES]; 2];
+            let n: [&Lanes; 3] = std::array::from_fn(|a| &slope_along[a][up(a)]);
+            let mut addend = [[0f32; LANES]; 2];
             for i in 0..LANES {
                 let weight = w[0][i] * w[1][i] * w[2][i];
                 let d = fma::<F>(
@@ -340,11 +338,11 @@ fn scatter_body<const F: bool>(
                     w[2][i],
                     w[0][i] * fma::<F>(n[1][i], w[2][i], n[2][i] * w[1][i]),
                 );
-                sum[0][i] = fma::<F>(gv[0][i], weight, qv[0][i] * d);
-                sum[1][i] = fma::<F>(gv[1][i], weight, qv[1][i] * d);
+                addend[0][i] = fma::<F>(gv[0][i], weight, qv[0][i] * d);
+                addend[1][i] = fma::<F>(gv[1][i], weight, qv[1][i] * d);
             }
             for i in 0..LANES {
-                add[k][i] = [sum[0][i], sum[1][i]];
+                add[k][i] = [addend[0][i], addend[1][i]];
             }
         }
         for i in 0..count {

@@ -5,8 +5,8 @@ use rayon::prelude::*;
 use tiface_base::geom::{Atlas, Hit, Mesh, bilinear_taps};
 use tiface_base::image::Image;
 
-/// Puts items into groups, in their order: `put` gets each with its place in the list of all groups.
-/// Returns where each group begins, and the end of the last.
+/// Sorts items into groups, in their order: `put` gets each item and its place among those of all
+/// groups. Returns the start of each group, and the end of the last.
 pub(super) fn grouped<T>(
     groups: usize,
     items: impl Iterator<Item = (u32, T)> + Clone,

@@ -27,22 +27,23 @@ pub struct Row {
     hits: Range<u32>,
 }
 
-/// What a ray meets, in little memory: there are tens of them a pixel.
+/// What a ray meets, in little memory: with soft layers there are tens of them a pixel.
 #[derive(Clone, Copy)]
-struct Met {
+struct PackedHit {
     triangle: u32,
-    /// Weights of the triangle's second and third vertex, rounded down to [`STEPS`].
+    /// Weights of the triangle's second and third vertex, in 1 / [`STEPS`]; rounded down, so that
+    /// they sum to 1 at most.
     weights: [u16; 2],
     /// Its share in the pixel.
     share: f32,
 }
 
-/// Steps of a weight from 0 to 1.
+/// Steps of a weight or share from 0 to 1.
 const STEPS: f32 = 65535.0;
 
-impl Met {
-    fn new(hit: &Hit, share: f32) -> Met {
-        Met { triangle: hit.triangle, weights: [hit.u, hit.v].map(|w| (w * STEPS) as u16), share }
+impl PackedHit {
+    fn new(hit: &Hit, share: f32) -> PackedHit {
+        PackedHit { triangle: hit.triangle, weights: [hit.u, hit.v].map(|w| (w * STEPS) as u16), share }
     }
 
     fn hit(&self) -> Hit {
@@ -63,7 +64,7 @@ pub struct Rows {
     rows: Vec<Row>,
     /// What their rays meet, of a ray layers first; the shares of a row sum to 1. It is shared with
     /// the rows that these are a part of.
-    met: Arc<Vec<Met>>,
+    met: Arc<Vec<PackedHit>>,
 }
 
 impl Deref for Rows {
@@ -101,9 +102,9 @@ impl Rows {
             }
             (rows, met)
         };
-        let parts: Vec<(Vec<Row>, Vec<Met>)> = lines.par_iter().map(line).collect();
+        let parts: Vec<(Vec<Row>, Vec<PackedHit>)> = lines.par_iter().map(line).collect();
         let mut rows = Vec::with_capacity(parts.iter().map(|part| part.0.len()).sum());
-        let mut met: Vec<Met> = Vec::with_capacity(parts.iter().map(|part| part.1.len()).sum());
+        let mut met: Vec<PackedHit> = Vec::with_capacity(parts.iter().map(|part| part.1.len()).sum());
         for (of_line, met_there) in parts {
             let base = u32::try_from(met.len()).expect("rays of some million pixels meet less");
             let moved = |Range { start, end }: Range<u32>| base + start..base + end;
@@ -121,10 +122,10 @@ impl Rows {
 
     /// Returns the nodes under all rows, and their weights.
     pub fn matrix(&self, nodes: &Nodes) -> Matrix {
-        let parts: Vec<(Vec<u32>, Shares)> = self
+        let parts: Vec<SparseRows> = self
             .par_chunks(1 << 14)
             .map(|rows| {
-                let (mut counts, mut shares) = (Vec::with_capacity(rows.len()), Shares::default());
+                let mut part = SparseRows { start: vec![0], ..SparseRows::default() };
                 let mut row: Vec<(u32, f32)> = Vec::new();
                 for Row { hits, .. } in rows {
                     row.clear();
@@ -134,27 +135,25 @@ impl Rows {
                             None => row.push((node, w * met.share)),
                         });
                     }
-                    counts.push(row.len() as u32);
-                    shares.of.extend(row.iter().map(|e| e.0));
-                    shares.share.extend(row.iter().map(|e| (e.1 * STEPS + 0.5) as u16));
+                    part.push_row(&row);
                 }
-                (counts, shares)
+                part
             })
             .collect();
-        let len = parts.iter().map(|part| part.1.of.len()).sum();
-        let mut rows = Shares { start: vec![0], of: Vec::with_capacity(len), share: Vec::with_capacity(len) };
-        for (counts, part) in parts {
-            for n in counts {
-                rows.start.push(rows.start[rows.start.len() - 1] + n);
-            }
-            rows.of.extend(part.of);
+        let len = parts.iter().map(|part| part.index.len()).sum();
+        let mut rows =
+            SparseRows { start: vec![0], index: Vec::with_capacity(len), share: Vec::with_capacity(len) };
+        for part in parts {
+            let base = rows.index.len() as u32;
+            rows.start.extend(part.start[1..].iter().map(|start| base + start));
+            rows.index.extend(part.index);
             rows.share.extend(part.share);
         }
-        let mut columns = Shares { start: Vec::new(), of: vec![0; len], share: vec![0; len] };
+        let mut columns = SparseRows { start: Vec::new(), index: vec![0; len], share: vec![0; len] };
         let by_node =
-            (0..self.len()).flat_map(|p| rows.stored(p).map(move |(node, share)| (node, (p as u32, share))));
+            (0..self.len()).flat_map(|p| rows.packed(p).map(move |(node, share)| (node, (p as u32, share))));
         columns.start = grouped(nodes.len(), by_node, |at, (row, share)| {
-            (columns.of[at], columns.share[at]) = (row, share);
+            (columns.index[at], columns.share[at]) = (row, share);
         });
         Matrix { rows, columns }
     }
@@ -168,7 +167,7 @@ impl Row {
         (view, photograph): (u32, &Photograph),
         [x, y]: [u32; 2],
         turned: Mat3,
-        met: &mut Vec<Met>,
+        met: &mut Vec<PackedHit>,
     ) -> Option<Row> {
         let Photograph { camera, photo, .. } = photograph;
         let at = y as usize * photo.width as usize + x as usize;
@@ -188,11 +187,11 @@ impl Row {
             let mut left = share;
             if let Some(layers) = layers {
                 layers.cast(&ray, hit.t, |_, hit, alpha| {
-                    met.push(Met::new(&hit, left * alpha));
+                    met.push(PackedHit::new(&hit, left * alpha));
                     left *= 1.0 - alpha;
                 });
             }
-            met.push(Met::new(&hit, left));
+            met.push(PackedHit::new(&hit, left));
         }
         let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
         Some(Row {
@@ -207,41 +206,53 @@ impl Row {
 
 /// Which nodes a row shows and which rows show a node, with the node's share of the row.
 pub struct Matrix {
-    rows: Shares,
-    columns: Shares,
+    rows: SparseRows,
+    columns: SparseRows,
 }
 
-/// For each row its nodes, or for each node its rows, with the node's share of the row: it takes
-/// most of the memory of a fit, and of its time.
+/// For each row its nodes, or for each node its rows, with the node's share of the row. They take
+/// most of a fit's memory, and reading them most of its time.
 #[derive(Default)]
-struct Shares {
+struct SparseRows {
     /// Where the entries of each begin; one more than there are.
     start: Vec<u32>,
     /// Node or row of each entry.
-    of: Vec<u32>,
-    /// Share of each entry, in [`STEPS`].
+    index: Vec<u32>,
+    /// Share of each entry, in 1 / [`STEPS`].
     share: Vec<u16>,
 }
 
-impl Shares {
+impl SparseRows {
+    /// Appends the entries of a row whose shares do not round to 0.
+    fn push_row(&mut self, row: &[(u32, f32)]) {
+        for &(index, share) in row {
+            let share = (share * STEPS + 0.5) as u16;
+            if share > 0 {
+                self.index.push(index);
+                self.share.push(share);
+            }
+        }
+        self.start.push(self.index.len() as u32);
+    }
+
     fn range(&self, i: usize) -> Range<usize> {
         self.start[i] as usize..self.start[i + 1] as usize
     }
 
     #[inline(always)]
-    fn stored(&self, i: usize) -> impl Iterator<Item = (u32, u16)> + Clone {
+    fn packed(&self, i: usize) -> impl Iterator<Item = (u32, u16)> + Clone {
         let range = self.range(i);
-        self.of[range.clone()].iter().copied().zip(self.share[range].iter().copied())
+        self.index[range.clone()].iter().copied().zip(self.share[range].iter().copied())
     }
 
     #[inline(always)]
     fn entries(&self, i: usize) -> impl Iterator<Item = (u32, f32)> {
-        self.stored(i).map(|(of, share)| (of, f32::from(share) * (1.0 / STEPS)))
+        self.packed(i).map(|(index, share)| (index, f32::from(share) * (1.0 / STEPS)))
     }
 }
 
 impl Matrix {
-    /// Returns the nodes of a row; their shares sum to 1.
+    /// Returns the nodes of a row; their shares sum to 1, but for rounding to [`STEPS`].
     #[inline(always)]
     pub fn row(&self, row: usize) -> impl Iterator<Item = (u32, f32)> {
         self.rows.entries(row)
@@ -257,5 +268,35 @@ impl Matrix {
     pub fn seen(&self) -> f64 {
         let nodes = self.columns.start.len() - 1;
         (0..nodes).filter(|&n| !self.columns.range(n).is_empty()).count() as f64 / nodes.max(1) as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn packed_hits_stay_on_their_triangle() {
+        let third = 1.0 / 3.0;
+        let places = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [third, third], [0.1, 0.9]];
+        for [u, v] in places.into_iter().chain([[-1e-7, 1.0 + 1e-7], [f32::EPSILON, 1.0]]) {
+            let packed = PackedHit::new(&Hit { t: 3.0, triangle: 7, u, v }, 0.25);
+            let hit = packed.hit();
+            assert_eq!((hit.triangle, packed.share), (7, 0.25));
+            assert!(hit.weights().iter().all(|w| (0.0..=1.0).contains(w)), "{u} {v}: {:?}", hit.weights());
+            assert!((hit.u - u).abs() <= 1.0 / STEPS && (hit.v - v).abs() <= 1.0 / STEPS, "{u} {v}");
+        }
+    }
+
+    #[test]
+    fn shares_are_stored_to_half_a_step_and_those_of_nothing_are_not() {
+        let shares = [0.5, 0.3, 0.2 - 4e-6, 4e-6, 0.0];
+        let mut rows = SparseRows { start: vec![0], ..SparseRows::default() };
+        rows.push_row(&[]);
+        rows.push_row(&(0..).zip(shares).collect::<Vec<_>>());
+        assert_eq!(rows.entries(0).count(), 0);
+        let stored: Vec<(u32, f32)> = rows.entries(1).collect();
+        assert_eq!(stored.iter().map(|entry| entry.0).collect::<Vec<_>>(), [0, 1, 2]);
+        assert!(stored.iter().zip(shares).all(|((_, own), share)| (own - share).abs() <= 0.51 / STEPS));
     }
 }

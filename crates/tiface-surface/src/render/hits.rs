@@ -20,7 +20,7 @@ pub struct RayHits {
 }
 
 impl RayHits {
-    /// Returns the hits of each ray.
+    /// Returns the range of each ray's hits, which follow each other.
     pub(super) fn rays(&self) -> impl Iterator<Item = Range<usize>> {
         let mut end = 0;
         let of_one_ray = |a: usize, b: usize| {

@@ -15,8 +15,8 @@ use tiface_base::geom::{Bvh, Camera, Hit, Mesh, Ray, ShellCaster, Similarity};
 /// batches.
 const BATCH: usize = 8192;
 
-/// Columns of a band that are rendered together.
-const TILE: usize = 16;
+/// Columns of a band that are rendered one row after the other.
+const COLUMNS: usize = 16;
 
 /// Depth change over one pixel, in pixel footprints, from which on it is an edge: tan 84°.
 const JUMP: f32 = 10.0;
@@ -136,7 +136,7 @@ impl Raycaster<'_> {
         let mut found = Vec::with_capacity(4 * n * n);
         // neighbors meet the same boxes and triangles
         let rows = depth.len() / w;
-        let columns = (0..w).step_by(TILE).map(|left| left..w.min(left + TILE));
+        let columns = (0..w).step_by(COLUMNS).map(|left| left..w.min(left + COLUMNS));
         let pixels =
             columns.flat_map(|tile| (0..rows).flat_map(move |y| tile.clone().map(move |x| y * w + x)));
         for i in pixels {

@@ -1,19 +1,19 @@
 //! Residuals: photograph minus rendered mesh in the training views, added to new views of the mesh.
 //!
-//! A hit gets the weighted mean `μ` of the residuals of the training views that see its point from
-//! a similar direction, as in view-dependent texture mapping (Debevec et al. 1996) and unstructured
-//! lumigraph rendering (Buehler et al. 2001). The weight of a view is
+//! A ray gets, at the heaviest of its hits, the weighted mean `μ` of the residuals of the training
+//! views that see its point from a similar direction, as in view-dependent texture mapping (Debevec
+//! et al. 1996) and unstructured lumigraph rendering (Buehler et al. 2001). The weight of a view is
 //!
 //! ```text
 //! w = c · v · g · (1 − u)² / (u + 0.1),    u = (1 − cos θ) / (1 − cos R)
 //! ```
 //!
 //! with the confidence `c` of the view's pixel, its visibility `v`, the slant `g` of the surface,
-//! and the angle `θ` between both directions, below the reach `R`. The hit's color changes by
-//! `μ · S / (S + w₀) / (1 + σ² / σ₀²)`, `S` being the sum of the weights and `σ²` the variance of
-//! the residuals: little where views are far or disagree. All factors are continuous, so that
-//! nothing pops along a camera path. Views that are judged get nothing of a photograph from their
-//! own position.
+//! and the angle `θ` between both directions, below the reach `R`. The colors of the ray's hits
+//! change by `μ · S / (S + w₀) / (1 + σ² / σ₀²)`, `S` being the sum of the weights and `σ²` the
+//! variance of the residuals: little where views are far or disagree. All factors are continuous,
+//! so that nothing pops along a camera path, but where another hit of a ray through soft layers
+//! becomes the heaviest. Views that are judged get nothing of a photograph from their own position.
 
 use super::{RayHits, RenderedView};
 use glam::{DVec3, Mat3, Vec2, Vec3};
@@ -122,8 +122,12 @@ impl Residuals {
         Some(Residuals { views, reach, leaves_out_own })
     }
 
-    /// Adds residuals to the sRGB-coded `colors` of hits. The hits of a ray, which lie close
-    /// together on the mesh, get what the heaviest of them has.
+    /// Adds residuals to the sRGB-coded `colors` of hits, `[n]`. The hits of a ray get what the
+    /// heaviest of them has: most lie close together, and looking up each took three times as long.
+    ///
+    /// # Panics
+    ///
+    /// Panics if there are fewer colors than hits.
     pub fn add(&self, hits: &RayHits, camera: &Camera, colors: &mut [[f32; 3]]) {
         let counts = |view: &&ResidualView| {
             !self.leaves_out_own || !is_same_position(view.camera.position, camera.position)

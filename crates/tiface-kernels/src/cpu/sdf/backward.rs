@@ -124,7 +124,7 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
         }
         let sums: (&mut [[f32; HIDDEN]], &mut [[f32; HIDDEN]]) =
             (g_w2.as_chunks_mut().0, g_b1.as_chunks_mut().0);
-        // copies, since the loop is compiled without vectors where its sums could lie in each other
+        // copies, since compilers do not vectorize a loop whose two sums may overlap
         let (mut g_row, mut g_bias) = (sums.0[0], sums.1[0]);
         let given = s.as_chunks::<HIDDEN>().0.iter().zip(g_a.as_chunks::<HIDDEN>().0);
         for ((s, g_a), g_z) in given.zip(g_z.as_chunks_mut::<HIDDEN>().0).take(rows) {
